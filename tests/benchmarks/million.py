@@ -79,7 +79,7 @@ class Rows:
             file = f"/meshes/{number:07}.off"
             row = {"id": file, "name": str(number), "class": str(classes[i]), "file": file}
             row |= {"checksum": f"{number:064x}", "bytes": number, "modified": number}
-            row |= {"volume": volumes[i], "thumbnail": generator.bytes(900)}
+            row |= {"volume": volumes[i]}
             rows.append(row)
         return torch.from_numpy(descriptions), rows
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 from bodies_on_disk import write_body
 
 import igps.data.pipeline as pipeline_module
@@ -158,65 +157,6 @@ def computed(monkeypatch):
 
     monkeypatch.setattr(pipeline_module, "compute_signature", counting)
     return numbers
-
-
-@pytest.mark.parametrize("subdivisions", [2, 3])
-def test_fewer_eigenpairs_are_the_beginning_of_the_default_number(tmp_path, computed, subdivisions):
-    """Of 642 vertices, and of 162, which are too few for the default number: both are subdivided alike.
-
-    A body without symmetry: in one that has some, rounding decides which of like points comes first.
-    """
-    body = trimesh.creation.icosphere(subdivisions=subdivisions)
-    waves = 1 + 0.2 * np.sin(2 * body.vertices @ [1.0, 0.7, 0.4])
-    body.vertices *= waves[:, None] * [1.0, 1.3, 1.9]
-    path = tmp_path / "egg.off"
-    body.export(path)
-    full = SignaturePipeline(USUAL, LoadOptions(), tmp_path / "cache")
-    full.signature(BodyRef(path))
-    needed = replace(full, config=NEEDED)
-    assert not is_cached(needed, BodyRef(path))
-    signature = needed.signature(BodyRef(path))
-    assert computed == [250]
-    assert is_cached(needed, BodyRef(path))
-    assert bool(signature.notes) == (subdivisions == 2)
-    expected = compute_signature(needed.mesh(BodyRef(path)), needed.config)
-    assert signature.config == expected.config
-    assert signature.notes == expected.notes
-    np.testing.assert_allclose(signature.eigenvalues, expected.eigenvalues, rtol=1e-9)
-    for kind in ("interior", "surface"):
-        one = getattr(signature, kind)
-        other = getattr(expected, kind)
-        np.testing.assert_allclose(one.points, other.points, atol=1e-12)
-        sizes = np.abs(one.eigenfunctions), np.abs(other.eigenfunctions)
-        np.testing.assert_allclose(*sizes, atol=1e-3)
-    # And never the other way round.
-    replace(needed, cache_dir=tmp_path / "other").signature(BodyRef(path))
-    replace(full, cache_dir=tmp_path / "other").signature(BodyRef(path))
-    assert computed == [250, 64, 250]
-
-
-def test_a_signature_of_another_mesh_or_with_other_samples_does_not_serve(pipeline, path, computed):
-    """The file has 162 vertices: enough for 64 eigenpairs, and subdivided for 250."""
-    replace(pipeline, config=USUAL).signature(BodyRef(path))
-    replace(pipeline, config=NEEDED).signature(BodyRef(path))
-    assert computed == [250]
-    replace(pipeline, config=replace(CONFIG, n_eigenpairs=64)).signature(BodyRef(path))
-    replace(pipeline, config=replace(CONFIG, n_eigenpairs=20)).signature(BodyRef(path))
-    replace(pipeline, config=replace(NEEDED, seed=1)).signature(BodyRef(path))
-    assert computed == [250, 64, 20, 64]
-
-
-def test_a_damaged_longer_signature_is_passed_over(path, tmp_path, computed):
-    pipeline = SignaturePipeline(USUAL, LoadOptions(), tmp_path / "cache")
-    pipeline.signature(BodyRef(path))
-    (file,) = (tmp_path / "cache").rglob("*.safetensors")
-    content = bytearray(file.read_bytes())
-    content[-1] ^= 1  # of an eigenfunction: the header does not tell
-    file.write_bytes(content)
-    needed = replace(pipeline, config=NEEDED)
-    for _ in range(2):
-        assert len(needed.signature(BodyRef(path)).eigenvalues) == 64
-        assert computed == [250, 64]
 
 
 def test_a_missing_file_is_named(pipeline, tmp_path):

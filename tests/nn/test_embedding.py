@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from igps.nn.embedding import SpectralEmbedding, spectral_embedding, spectral_weights
+from igps.nn.embedding import SpectralEmbedding, spectral_embedding
 
-KINDS = [("commute_time", None), ("diffusion", 0.01), ("biharmonic", None)]
 AREA = 2.7
 
 
@@ -23,37 +22,12 @@ def spectrum():
     return torch.randn(20, 12, generator=generator, dtype=torch.float64), eigenvalues
 
 
-def embed(kind, time, functions, values, area=AREA):
-    return spectral_embedding(
-        functions, values, torch.tensor(area, dtype=torch.float64), kind=kind, time=time
-    )
-
-
-def learned(kind, time):
-    module = SpectralEmbedding(kind, time=time, n_knots=9)
+def learned():
+    module = SpectralEmbedding(n_knots=9)
     assert module.log_gain is not None
     with torch.no_grad():
         module.log_gain.copy_(torch.randn(9, generator=torch.Generator().manual_seed(1)))
     return module
-
-
-@pytest.mark.parametrize(
-    ("kind", "time", "weight"),
-    [
-        ("commute_time", None, lambda value: 1 / math.sqrt(value)),
-        ("diffusion", 0.01, lambda value: math.sqrt(AREA) * math.exp(-value * AREA * 0.01)),
-        ("biharmonic", None, lambda value: 1 / (value * math.sqrt(AREA))),
-    ],
-)
-def test_weights_are_the_definition(spectrum, kind, time, weight):
-    functions, values = spectrum
-    expected = functions.numpy() * [weight(float(value)) for value in values]
-    found = embed(kind, time, functions, values)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-    module = SpectralEmbedding(kind, time=time)
-    np.testing.assert_allclose(
-        module(functions, values, torch.tensor(AREA, dtype=torch.float64)), expected, rtol=1e-12
-    )
 
 
 def test_default_is_the_commute_time(spectrum):
@@ -61,11 +35,10 @@ def test_default_is_the_commute_time(spectrum):
     assert torch.equal(SpectralEmbedding()(*spectrum, area), commute_time_embedding(*spectrum))
 
 
-@pytest.mark.parametrize(("kind", "time"), KINDS)
 @pytest.mark.parametrize("is_learned", [False, True])
-def test_does_not_change_with_scale(spectrum, kind, time, is_learned):
+def test_does_not_change_with_scale(spectrum, is_learned):
     functions, values = spectrum
-    module = learned(kind, time) if is_learned else SpectralEmbedding(kind, time=time)
+    module = learned() if is_learned else SpectralEmbedding()
     scale = 7.0
     scaled = module(
         functions / scale, values / scale**2, torch.tensor(AREA * scale**2, dtype=torch.float64)
@@ -74,10 +47,10 @@ def test_does_not_change_with_scale(spectrum, kind, time, is_learned):
     torch.testing.assert_close(scaled, expected, rtol=1e-9, atol=0)
 
 
-@pytest.mark.parametrize(("kind", "time"), KINDS)
-def test_padding_has_no_weight(spectrum, kind, time):
+@pytest.mark.parametrize("is_learned", [False, True])
+def test_padding_has_no_weight(spectrum, is_learned):
     functions, values = spectrum
-    module = learned(kind, time)
+    module = learned() if is_learned else SpectralEmbedding()
     padded_values = torch.full((2, 12), math.inf, dtype=torch.float64)
     padded_values[0] = values
     padded_values[1, :5] = values[:5]
@@ -102,22 +75,21 @@ def test_keeps_the_first_eigenpairs(spectrum):
             module(functions, values, area), commute_time_embedding(functions[:, :4], values[:4])
         )
     assert torch.equal(
-        spectral_embedding(functions, values, area, n_eigenpairs=4), module(functions, values, area)
+        spectral_embedding(functions, values, n_eigenpairs=4), module(functions, values, area)
     )
     found = SpectralEmbedding(n_eigenpairs=99)(functions, values, area).shape
     assert found == (20, 12)
 
 
-@pytest.mark.parametrize(("kind", "time"), KINDS)
-def test_learned_filter_starts_at_its_kind(spectrum, kind, time):
+def test_learned_filter_starts_at_the_fixed_one(spectrum):
     area = torch.tensor(AREA)
-    start = SpectralEmbedding(kind, time=time, n_knots=16)
-    plain = SpectralEmbedding(kind, time=time)
+    start = SpectralEmbedding(n_knots=16)
+    plain = SpectralEmbedding()
     assert torch.equal(start(*spectrum, area), plain(*spectrum, area))
 
 
 def test_learned_filter_interpolates_its_knots_in_log():
-    module = learned("commute_time", None)
+    module = learned()
     assert module.log_gain is not None
     gain = module.log_gain.detach().double().numpy()
     x = np.geomspace(0.5, 20_000, 333)
@@ -147,26 +119,13 @@ def test_gradient_of_the_filter(spectrum):
 def test_result_has_single_precision_at_least(spectrum):
     functions, values = spectrum
     for dtype in (torch.float32, torch.bfloat16):
-        result = embed("diffusion", 0.01, functions.to(dtype), values)
+        result = spectral_embedding(functions.to(dtype), values)
         assert result.dtype == torch.float32
-        expected = embed("diffusion", 0.01, functions.to(dtype).double(), values)
+        expected = spectral_embedding(functions.to(dtype).double(), values)
         np.testing.assert_allclose(result, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("kind", "options", "message"),
-    [
-        ("heat", {}, "kind: expected one of commute_time"),
-        ("diffusion", {}, "time: expected a positive"),
-        ("diffusion", {"time": -1.0}, "time: expected a positive"),
-        ("biharmonic", {"time": 1.0}, "time: expected None"),
-        ("commute_time", {"n_knots": 1}, "n_knots"),
-        ("commute_time", {"n_eigenpairs": 0}, "n_eigenpairs"),
-    ],
-)
-def test_bad_filter_is_refused(kind, options, message):
-    with pytest.raises(ValueError, match=message):
-        SpectralEmbedding(kind, **options)
-    if set(options) <= {"time"}:
-        with pytest.raises(ValueError, match=message):
-            spectral_weights(torch.ones(3), torch.ones(()), kind, **options)
+@pytest.mark.parametrize("options", [{"n_knots": 1}, {"n_eigenpairs": 0}])
+def test_bad_filter_is_refused(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        SpectralEmbedding(**options)

@@ -260,7 +260,7 @@ def test_functions_stand_beside_the_modules():
     real = batch.interior.mask[1]
     known = torch.isfinite(batch.eigenvalues[1])
     embedding = functional.spectral_embedding(
-        batch.interior.eigenfunctions[1, real][:, known], batch.eigenvalues[1, known], batch.area[1]
+        batch.interior.eigenfunctions[1, real][:, known], batch.eigenvalues[1, known]
     )
     found = functional.pair_histogram(embedding, functional.barycentroid_potential(embedding))
     expected = PairHistogram()(batch)[1]

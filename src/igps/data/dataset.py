@@ -49,8 +49,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
             each of which `as_mesh` accepts. Images and pairs `(labels, spacing)` of an array give a body per label.
         config: parameters of the Signatures. The default is 250 eigenpairs, unless the descriptor sets a number.
         cache_dir: directory of the cache; the user's cache directory if None. A cache key is the hash of the content
-            of the file, the load options, all parameters, and the version of the algorithm. The 64 or more eigenpairs
-            that a descriptor needs are taken from a cached Signature of the default 250, if there is one.
+            of the file, the load options, all parameters, and the version of the algorithm.
         descriptor: a descriptor, such as `igps.descriptor(NAME)`; the Signatures meet its requirements.
         labels: class names of the given paths.
         classes: rule for the class of a body, see `ClassRule`; "folder" if None.

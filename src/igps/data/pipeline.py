@@ -236,25 +236,14 @@ class SignaturePipeline:
         signature = cache.get(key, decode)
         if signature is not None:
             return signature
-        signature = self._beginning_of_longer(body, content)
-        if signature is None:
-            try:
-                mesh = self.mesh(body) if mesh is None else mesh
-                signature = compute_signature(mesh, self.config)
-            except MeshError as error:
-                self._remember(body, content, error)
-                raise
+        try:
+            mesh = self.mesh(body) if mesh is None else mesh
+            signature = compute_signature(mesh, self.config)
+        except MeshError as error:
+            self._remember(body, content, error)
+            raise
         self._put("signature", key, encode(signature))
         return signature
-
-    def _beginning_of_longer(self, body: BodyRef, content: Content) -> Signature | None:
-        """Return the first eigenpairs of a cached Signature that has the default number, if these are the same."""
-        longer = self.config.longer()
-        if longer is None:
-            return None
-        key = signature_key(content, body, self.reading, longer)
-        signature = self.cache("signature").get(key, decode)
-        return None if signature is None else signature.truncated(self.config)
 
     def _attribute(
         self, body: BodyRef, signature: Signature, name: str, key: str

@@ -20,7 +20,7 @@ try:
 except ImportError as error:
     raise ImportError('a gallery needs LanceDB: pip install "interior-gps[index]".') from error
 
-ARROW_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bytes: pa.binary()}
+ARROW_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64()}
 """Types of the columns of metadata."""
 
 _HEAD = b"gallery"  # key of the metadata of a table

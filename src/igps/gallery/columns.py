@@ -17,7 +17,6 @@ KNOWN: dict[str, type] = {
     "area": float,
     "volume": float,
     "unit": str,
-    "thumbnail": bytes,
 }
 """Names and types of the columns that every gallery has, beside the description."""
 

@@ -1,13 +1,11 @@
 """Rows of a gallery: the description of each body with its metadata."""
 
-import io
 import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,10 +19,8 @@ from igps.mesh.formats import dependencies_of, stat_key
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
-from igps.signature.signature import Signature
 
 _BATCH_SIZE = 256  # descriptions in memory at once
-_THUMBNAIL_SIZE = 40  # pixels
 
 
 def described_rows(
@@ -149,32 +145,9 @@ def checksum_of(dataset: SignatureDataset, i: int) -> str:
         return ""
 
 
-def thumbnail(signature: Signature) -> bytes:
-    """Return a PNG of the surface samples of a body, seen along its shortest axis; near samples are brighter."""
-    from matplotlib.image import imsave
-
-    points = np.asarray(
-        signature.surface.points if len(signature.surface) else signature.interior.points,
-        np.float64,
-    )
-    centred = points - points.mean(axis=0)
-    along_axes = centred @ np.linalg.eigh(centred.T @ centred)[1][:, ::-1]
-    width = np.abs(along_axes[:, :2]).max(initial=1e-300)
-    depth = np.abs(along_axes[:, 2]).max(initial=1e-300)
-    columns, rows = (
-        np.rint((along_axes[:, :2] / width + 1) * (_THUMBNAIL_SIZE - 1) / 2).astype(int).T
-    )
-    image = np.zeros((_THUMBNAIL_SIZE, _THUMBNAIL_SIZE))
-    file = io.BytesIO()
-    np.maximum.at(image, (rows, columns), 0.6 + 0.4 * along_axes[:, 2] / depth)
-    imsave(file, image, cmap="gray", vmin=0, vmax=1, origin="lower", format="png")
-    return file.getvalue()
-
-
 def _measured(dataset: SignatureDataset, i: int) -> dict[str, Any]:
     signature = dataset[i].signature
-    measured = {name: getattr(signature, name) for name in ("area", "volume", "unit")}
-    return {**measured, "thumbnail": thumbnail(signature)}
+    return {name: getattr(signature, name) for name in ("area", "volume", "unit")}
 
 
 def _described(

@@ -337,7 +337,7 @@ def _index(table: Any) -> None:
     if n_rows >= _MIN_ROWS_FOR_INDEX:
         indexed = {index.columns[0] for index in table.list_indices()}
         for column in table.schema.names:
-            if column in {"vector", "thumbnail", *indexed}:
+            if column in {"vector", *indexed}:
                 continue
             config: BTree | IvfSq = BTree()
             if column == "short":

@@ -12,7 +12,6 @@ from igps.nn.embedding import (
     barycentroid_potential,
     interior_distance,
     spectral_embedding,
-    spectral_weights,
 )
 from igps.nn.histograms.pairs import joint_histogram, pair_histogram
 from igps.nn.histograms.points import point_histogram
@@ -33,6 +32,5 @@ __all__ = [
     "point_pair_features",
     "soft_memberships",
     "spectral_embedding",
-    "spectral_weights",
     "square_root",
 ]

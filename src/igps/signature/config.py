@@ -18,8 +18,7 @@ class SignatureConfig:
     """Every parameter that a Signature depends on.
 
     With 64 eigenpairs or more, the samples of a Signature and their first eigenfunctions do not depend on the number of
-    eigenpairs. A Signature is then the beginning of one with more eigenpairs, see `longer` and `Signature.truncated`.
-    This requires the same mesh for both: a mesh with fewer vertices than `least_vertices` is subdivided.
+    eigenpairs. This requires the same mesh: a mesh with fewer vertices than `least_vertices` is subdivided.
 
     Example:
         >>> SignatureConfig(n_eigenpairs=50).min_samples, SignatureConfig.paper().min_samples
@@ -102,8 +101,8 @@ class SignatureConfig:
     def with_eigenpairs(self, n_eigenpairs: int) -> Self:
         """Return a configuration with at least `n_eigenpairs`, or this one if its own number is set.
 
-        It has at least 64, and meshes are subdivided as for the default number, so that its Signature is the beginning
-        of the default one.
+        It has at least 64, and meshes are subdivided as for the default number, so that its samples are those of the
+        default one.
         """
         if self.n_eigenpairs is not None:
             return self
@@ -111,19 +110,6 @@ class SignatureConfig:
         if n_computed >= self.DEFAULT_EIGENPAIRS:
             return replace(self, n_eigenpairs=n_computed)
         return replace(self, n_eigenpairs=n_computed, least_vertices=self.n_vertices_read)
-
-    def longer(self) -> Self | None:
-        """Return the configuration with the default number of eigenpairs, if its Signatures begin with this one's.
-
-        They do if the mesh and the order of the samples are the same; otherwise None is returned.
-        """
-        default = self.DEFAULT_EIGENPAIRS
-        has_same_order = _N_ORDERING_EIGENPAIRS <= self.n_kept < default
-        has_same_mesh = self.n_vertices_read == default + 2
-        is_possible = self.max_vertices is None or self.max_vertices > default + 1
-        if not (has_same_order and has_same_mesh and is_possible):
-            return None
-        return replace(self, n_eigenpairs=default, least_vertices=None)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the parameters and the algorithm's version by name, without `least_vertices` if it has its default."""

@@ -153,16 +153,6 @@ class Signature:
         """Return the Signature with a function applied to its interior and to its surface samples."""
         return replace(self, interior=change(self.interior), surface=change(self.surface))
 
-    def truncated(self, config: SignatureConfig) -> Signature:
-        """Return the Signature of a configuration with fewer eigenpairs, whose `longer` one is the present `config`."""
-
-        def cut(samples: Samples) -> Samples:
-            functions = np.ascontiguousarray(samples.eigenfunctions[:, : config.n_kept])
-            return replace(samples, eigenfunctions=functions)
-
-        eigenvalues = self.eigenvalues[: config.n_kept].copy()
-        return replace(self.map_samples(cut), eigenvalues=eigenvalues, config=config)
-
 
 @one_thread()
 def compute_signature(
