@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from bodies_on_disk import write_body
 
-import igps.data.pipeline as pipeline_module
 from igps.data import keys
 from igps.data.cache_hit import CacheHit
 from igps.data.pipeline import SignaturePipeline
@@ -140,23 +139,6 @@ def test_a_body_that_cannot_be_used_is_not_read_again_until_it_changes(pipeline,
     assert str(second.value) == str(first.value)
     write_body(path, 1.1, 1.5)
     assert isinstance(pipeline.fill([BodyRef(path)])[0], CacheHit)
-
-
-USUAL = replace(CONFIG, n_eigenpairs=None)
-NEEDED = USUAL.with_eigenpairs(50)
-
-
-@pytest.fixture
-def computed(monkeypatch):
-    """The numbers of eigenpairs of the signatures that are computed, not read."""
-    numbers = []
-
-    def counting(mesh, config):
-        numbers.append(config.n_kept)
-        return compute_signature(mesh, config)
-
-    monkeypatch.setattr(pipeline_module, "compute_signature", counting)
-    return numbers
 
 
 def test_a_missing_file_is_named(pipeline, tmp_path):
