@@ -754,7 +754,6 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
             ["retrieve", "ROOT", "--with", "ct=-1"],
             "with: expected NAME or NAME=WEIGHT with a weight above 0, such as",
         ),
-        (["duplicates", "ROOT", "--tolerance", "0.5"], "tolerance: expected 0 to 0.02, got 0.5."),
         (
             ["classify", "ROOT", "--model", "plain.safetensors"],
             "model: expected a classifier, got d2.",

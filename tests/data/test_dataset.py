@@ -16,7 +16,7 @@ import igps.data.pipeline as pipeline_module
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.transforms import FewerSamples, Scale
+from igps.data.transforms import FewerSamples
 from igps.failures import Limits, MachineError
 from igps.mesh.errors import MeshError
 from igps.signature.signature import SignatureConfig
@@ -369,20 +369,20 @@ def test_a_transform_is_applied_at_each_reading_and_not_kept(dataset, counted):
     assert found == 5
 
 
-class CountedScale:
-    """A change of scale of one's own, which counts its bodies."""
+class CountedTransform:
+    """A transform of one's own, which counts its bodies."""
 
     def __init__(self, seed, applied):
-        self.scale = Scale(seed=seed)
+        self.few = FewerSamples(n_interior=9, seed=seed)
         self.applied = applied
 
     @property
     def cache_tag(self):
-        return self.scale.cache_tag
+        return self.few.cache_tag
 
     def __call__(self, signature):
         self.applied.append(signature.name)
-        return self.scale(signature)
+        return self.few(signature)
 
 
 def test_a_pre_transform_is_kept_under_a_key_of_its_own(dataset, counted, root):
@@ -391,15 +391,15 @@ def test_a_pre_transform_is_kept_under_a_key_of_its_own(dataset, counted, root):
     applied = []
 
     def changed(seed):
-        own = CountedScale(seed, applied)
+        own = CountedTransform(seed, applied)
         return SignatureDataset(root, CONFIG, dataset.pipeline.cache_dir, pre_transform=own)
 
     first = changed(0)
-    volume = first[0].signature.volume
-    assert volume != dataset[0].signature.volume
-    assert volume == changed(0)[0].signature.volume
+    points = first[0].signature.interior.points
+    assert len(points) == 9
+    assert (points == changed(0)[0].signature.interior.points).all()
     assert len(applied) == 1
-    assert changed(1)[0].signature.volume != volume
+    assert (points != changed(1)[0].signature.interior.points).any()
     assert len(applied) == 2
     assert counted == []  # no eigenpairs for any of it
     assert first.precompute(n_workers=1, progress=False) == []
@@ -412,7 +412,7 @@ def test_a_pre_transform_is_kept_under_a_key_of_its_own(dataset, counted, root):
     found = [first.key(i) for i in range(len(first))]
     assert found == keys
     for wrong, message in (
-        (Scale(), "expected a seed"),
+        (FewerSamples(n_interior=9), "expected a seed"),
         (lambda signature: signature, "expected an object with a cache_tag"),
     ):
         with pytest.raises(ValueError, match=f"pre_transform: {message}"):
@@ -508,7 +508,7 @@ def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(root, tmp_p
     assert changed(2.0).cached_keys() != changed(3.0).cached_keys()
     with pytest.raises(ValueError, match="pre_transform: expected attributes with a cache_tag"):
         SignatureDataset(
-            root, attributes={"x": lambda points: points[:, 0]}, pre_transform=Scale(seed=0)
+            root, attributes={"x": lambda points: points[:, 0]}, pre_transform=FewerSamples(seed=0)
         )
 
 

@@ -9,7 +9,6 @@ import trimesh
 
 import igps
 from igps.data.collation import collate
-from igps.data.transforms import Scale
 from igps.descriptors.measures import Measures
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import SignatureConfig, compute_signature
@@ -52,12 +51,6 @@ def test_scaled_bodies_differ_by_their_size_alone():
     expected = torch.full_like(doubled, math.log(2))
     torch.testing.assert_close(doubled, expected, atol=1e-3, rtol=0)
     torch.testing.assert_close(logarithms[3], logarithms[0], atol=1e-3, rtol=0)
-
-
-def test_a_scaled_signature_has_the_numbers_of_the_scaled_body():
-    scaled = Scale(smallest=2, largest=2, seed=0)(compute_signature(ellipsoid(1, 2, 3), CONFIG))
-    expected = compute_signature(ellipsoid(2, 4, 6), CONFIG)
-    assert dict(scaled.measures) == pytest.approx(dict(expected.measures))
 
 
 def test_bodies_without_numbers_are_refused():

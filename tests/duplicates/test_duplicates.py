@@ -169,17 +169,12 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
         nibabel.Nifti1Image(labels(1.4), np.diag([1.4, 1.4, 1.4, 1])), tmp_path / "sampled.nii"
     )
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
-    found = duplicates(dataset, tolerance=0.01, n_workers=1)
+    found = duplicates(dataset, n_workers=1)
     names = ("given.nii.gz", "mgh.mgz", "turned.nii", "cropped.nii")
     assert grouped(found.groups) == {
         frozenset(f"{name}#{label}" for name in names) for label in (1, 2)
     }
     assert set(found.grades.values()) == {"same mesh"}
-    near = {frozenset(pair) for pair in found.nearly if "sampled" in str(pair)}
-    expected = set()
-    for label in (1, 2):
-        expected |= {frozenset((f"{name}#{label}", f"sampled.nii#{label}")) for name in names}
-    assert near == expected
 
 
 def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path):
@@ -195,16 +190,6 @@ def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path):
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     found = grouped(duplicates(dataset, n_workers=1).groups)
     assert found == {frozenset({"one.off", "copy.off"})}
-    assert duplicates(dataset, n_workers=1).nearly == {}
-    near = duplicates(dataset, n_workers=1, tolerance=0.02).nearly
-    assert {frozenset(pair) for pair in near} & {
-        frozenset({"one.off", "longer.off"}),
-        frozenset({"copy.off", "longer.off"}),
-    }
-    for pair in near:
-        assert "longer.off" in pair
-    with pytest.raises(ValueError, match=r"tolerance: expected 0 to 0\.02"):
-        duplicates(dataset, n_workers=1, tolerance=0.5)
 
 
 def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path):

@@ -20,7 +20,6 @@ DESCRIPTOR = "pretrained"
 def duplicates(
     root: Path,
     size: Size = "auto",
-    tolerance: float = 0.0,
     out: Path | None = None,
     **reading: Any,
 ) -> dict[str, Any]:
@@ -30,26 +29,19 @@ def duplicates(
         root: folder of meshes.
         size: keep treats bodies of different size as different, ignore does not; auto is keep where all files have a
             unit.
-        tolerance: also list pairs that are not duplicates but no farther apart than this fraction of the square root of
-            the area, at most 0.02.
         out: CSV file for the groups.
     """
     from igps.cli.reading import Folder, signatures
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import keeps_size
     from igps.duplicates.duplicates import duplicates as find_duplicates
-    from igps.duplicates.surfaces import MAX_TOLERANCE
     from igps.report.tables import write_rows
 
-    if not 0 <= tolerance <= MAX_TOLERANCE:
-        raise ValueError(f"tolerance: expected 0 to {MAX_TOLERANCE}, got {tolerance}.")
     dataset, unread = signatures(Folder(root), [descriptor_of(DESCRIPTOR)], **reading)
     if warning := keeps_size(size, dataset.units())[1]:
         print(warning)
     n_workers = reading.get("n_workers")
-    result = find_duplicates(
-        dataset, size=size, tolerance=tolerance, n_workers=n_workers, progress=True
-    )
+    result = find_duplicates(dataset, size=size, n_workers=n_workers, progress=True)
     _print_groups(result)
     if failures := [*result.failures, *unread]:
         print(
@@ -79,9 +71,6 @@ def duplicates(
     return {
         "groups": [list(group) for group in result.groups],
         "pairs": pairs,
-        "nearly": [
-            {"files": list(pair), "distance": apart} for pair, apart in result.nearly.items()
-        ],
         "n_files": result.n_files,
         "n_skipped": len(failures),
     }
@@ -94,8 +83,6 @@ def _print_groups(result: Duplicates) -> None:
         print(f"group {number}: " + "  ".join(group))
     for pair in sorted(result.mirrored):
         print(f"mirror image: {'  '.join(pair)}")
-    for pair, distance in result.nearly.items():
-        print(f"nearly: {'  '.join(pair)}  {distance:.3%} of the square root of the area apart")
     threshold = Calibration.load().detail
     n_grouped = sum(map(len, result.groups))
     grades = "".join(

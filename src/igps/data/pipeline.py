@@ -62,7 +62,7 @@ class SignaturePipeline:
         if self.pre_transform is not None and not getattr(self.pre_transform, "cache_tag", None):
             raise ValueError(
                 f"pre_transform: expected an object with a cache_tag, got {self.pre_transform!r}. "
-                "Derive it from igps.data.transforms.Transform, or pass it as transform=, which is "
+                "Give it one, or pass it as transform=, which is "
                 "not cached."
             )
 

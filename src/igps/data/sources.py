@@ -373,8 +373,8 @@ def _bodies_in_files(
     body_columns = {
         name: tuple(values[i] for i in indices) for name, values in (columns or {}).items()
     }
-    labels = None if None in labels else labels
-    return Bodies(paths, names, labels, parts, body_columns, numbers_of)
+    known_labels = None if None in labels else labels
+    return Bodies(paths, names, known_labels, parts, body_columns, numbers_of)
 
 
 def _number_lone_labels(listed: dict[Path, list[BodyRef]]) -> None:

@@ -40,8 +40,6 @@ class Duplicates:
     # of the length if known
     largest: dict[tuple[str, str], tuple[float, float, str | None]]
     mirrored: frozenset[tuple[str, str]]  # of these pairs; the others agree without a reflection
-    # Distances over √area of pairs that are not copies, but within the tolerance
-    nearly: dict[tuple[str, str], float]
     n_files: int  # that were compared
     failures: tuple[Failure, ...]  # files that could not be compared
 
@@ -59,7 +57,6 @@ def duplicates(
     dataset: SignatureDataset,
     *,
     size: Size = "auto",
-    tolerance: float = 0.0,
     calibration: Calibration | None = None,
     n_workers: int | None = None,
     progress: bool = False,
@@ -69,24 +66,23 @@ def duplicates(
     Args:
         dataset: the files.
         size: whether bodies of different size are different, see `keeps_size`.
-        tolerance: distance over √area, up to 0.02. Pairs of different bodies within it are returned as `nearly`.
         calibration: of the distances; the built-in calibration if None.
         n_workers: threads; all cores if None.
         progress: show progress bars.
 
     Raises:
-        ValueError: the calibration belongs to other Signatures, or the tolerance is out of range.
+        ValueError: the calibration belongs to other Signatures.
         MeshError: none of the meshes can be described.
     """
     work = _Work(calibration or Calibration.load(), n_workers, progress)
     work.calibration.check_signatures(dataset.config)
-    limit = max(work.calibration.same.distance, tolerance)
+    limit = work.calibration.same.distance
     moments, failures = Surfaces(dataset).moments(limit, n_workers, progress)
     near = near_pairs(moments, _CANDIDATE_FACTOR * limit, progress)
     dataset = dataset.usable(failures)
     if keeps_size(size, dataset.units())[0]:
         near = of_one_size(near, dataset)
-    surfaces = Surfaces(dataset, tolerance)
+    surfaces = Surfaces(dataset)
     joined = _regroup(_join(near, surfaces, work), surfaces, work)
     return _graded(dataset, joined, surfaces, [*failures, *surfaces.failures.values()], work)
 
@@ -115,12 +111,6 @@ def _graded(
         length, unit = surfaces.length(i)
         grades[pair] = grade
         largest[pair] = (deviation, deviation * length, unit)
-    group_of = {i: number for number, group in enumerate(groups) for i in group}
-    nearly: dict[tuple[str, str], float] = {}
-    for (i, j), distance in sorted(surfaces.nearly.items()):
-        one = group_of.get(i)
-        if one is None or one != group_of.get(j):
-            nearly[names[i], names[j]] = distance
     return Duplicates(
         groups=tuple(tuple(names[i] for i in group) for group in groups),
         paths={names[i]: dataset.bodies.paths[i] for group in groups for i in group},
@@ -128,7 +118,6 @@ def _graded(
         grades=grades,
         largest=largest,
         mirrored=mirrored,
-        nearly=nearly,
         n_files=len(dataset),
         failures=tuple(failures),
     )

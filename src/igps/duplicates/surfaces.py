@@ -46,8 +46,6 @@ _NORMALS: AttributeName = "surface_direction"
 # Distance at which an alignment is given up; a tenth of it is large between copies
 _HOPELESS = 0.03
 _MAX_STRETCH = 0.1  # difference of log extents above which bodies are not aligned; copies differ by up to 0.045
-MAX_TOLERANCE = 0.02
-"""Largest `tolerance`, over √area."""
 _ROUNDING = 5e-4  # largest displacement of a vertex by rounding of the coordinates in a file
 # Largest deviation of a sample between triangulations of one surface: ten times that of 40 such copies. A hole that is
 # 0.5 % larger deviates more, if its radius is at least 0.005.
@@ -89,35 +87,19 @@ class Surfaces:
 
     Args:
         dataset: the bodies. Their Signatures give samples; a mesh itself is read only if another body is near.
-        tolerance: distance over √area up to which different bodies are recorded in `nearly`.
 
     Attributes:
         failures: bodies that could not be read, by index.
-        nearly: distances of the pairs that `distance` found to differ, but within the tolerance, by their indices.
-
-    Raises:
-        ValueError: the tolerance is out of range.
     """
 
-    def __init__(self, dataset: SignatureDataset, tolerance: float = 0.0) -> None:
-        if not 0 <= tolerance <= MAX_TOLERANCE:
-            raise ValueError(
-                f"tolerance: expected 0 to {MAX_TOLERANCE} of the root of the area, got {tolerance}."
-            )
+    def __init__(self, dataset: SignatureDataset) -> None:
         self.failures: dict[int, Failure] = {}
-        self.nearly: dict[tuple[int, int], float] = {}
-        self._tolerance = tolerance
         self._dataset = dataset
         self._cached_samples = lru_cache(_N_CACHED_SAMPLES)(self.samples)
         self._cached_mesh = lru_cache(_N_CACHED_MESHES)(self._mesh)
         self._cached_triangles = lru_cache(_N_CACHED_MESHES)(self._triangles)
         self._cached_vertices = lru_cache(_N_CACHED_MESHES)(self._vertices_and_faces)
         self._cached_coarseness = lru_cache(None)(self._coarseness_and_handles)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the bodies."""
-        return self._dataset.bodies.names
 
     def samples(self, i: int) -> SurfaceSamples:
         """Return the surface samples of a body; raise a MeshError if it is unusable, a ValueError without normals."""
@@ -140,22 +122,16 @@ class Surfaces:
         with contextlib.suppress(MeshError):  # recorded in `failures`
             one = self._cached_samples(i)
             other = self._cached_samples(j)
-            max_distance = max(calibration.same.distance, self._tolerance)
             limit = 0.0
-            distance = distance_if_alike(
-                one, other, stop_at=calibration.same.distance, max_distance=max_distance
-            )
-            if distance <= calibration.same.distance:
+            same = calibration.same.distance
+            distance = distance_if_alike(one, other, stop_at=same, max_distance=same)
+            if distance <= same:
                 limit = self.limit(i, j, calibration)
                 if distance > limit > 0:
                     # The search stopped below `same`. A longer search may get below the limit
-                    distance = distance_if_alike(
-                        one, other, stop_at=limit, max_distance=max(limit, self._tolerance)
-                    )
+                    distance = distance_if_alike(one, other, stop_at=limit, max_distance=limit)
             if distance <= limit and not _is_changed(one, other, distance):
                 return distance
-            if distance <= self._tolerance:
-                self.nearly[min(i, j), max(i, j)] = distance
         return math.inf
 
     def grade(self, i: int, j: int) -> tuple[Grade, float]:

@@ -4,8 +4,7 @@ import io
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from igps._arrays import Singles
 from igps.gallery.columns import Batch, Row
-from igps.retrieval.vectors import SearchDistance, VectorMap
+from igps.retrieval.vectors import VectorMap
 
 try:
     import pyarrow as pa
@@ -27,49 +26,34 @@ _HEAD = b"gallery"  # key of the metadata of a table
 _MAX_SINGLE = 1024  # numbers; longer descriptions are stored in half precision
 
 
-@dataclass(frozen=True, eq=False)
-class ShortVectors:
-    """Short vectors of descriptions, for LanceDB's index: weighted descriptions, reduced by a `VectorMap`."""
-
-    weights: Singles  # (F,), see `Descriptor.search_weights`
-    map: VectorMap
-
-    @classmethod
-    def fit(cls, descriptions: Tensor, searched_by: SearchDistance, weights: Any) -> Self:
-        """Fit to example descriptions (N, ...); `weights` is None for equal weights."""
-        values = descriptions.flatten(1).float().numpy()
-        if weights is None:
-            weights = np.ones(values.shape[1])
-        weights = np.asarray(weights, np.float32)
-        return cls(weights, VectorMap.fit(values * weights, searched_by))
-
-    def __call__(self, descriptions: Tensor) -> Singles:
-        """Map descriptions (N, ...) to short vectors (N, D)."""
-        values = descriptions.flatten(1).cpu().float().numpy()
-        return self.map(values * self.weights)
-
-    def to_table(self) -> Any:
-        """Return an Arrow table of one row that holds these arrays."""
-        file = io.BytesIO()
-        np.savez(file, weights=self.weights, **self.map.arrays())
-        return pa.table({"arrays": pa.array([file.getvalue()], pa.large_binary())})
-
-    @classmethod
-    def of_table(cls, table: Any) -> Self:
-        """Read what `to_table` wrote."""
-        file = io.BytesIO(table["arrays"][0].as_py())
-        with np.load(file, allow_pickle=False) as arrays:
-            return cls(arrays["weights"], VectorMap.of_arrays(arrays))
+def map_to_table(short: VectorMap) -> Any:
+    """Return an Arrow table of one row that holds a map to short vectors."""
+    file = io.BytesIO()
+    np.savez(file, **short.arrays())
+    return pa.table({"arrays": pa.array([file.getvalue()], pa.large_binary())})
 
 
-def encoded(batch: Batch, columns: Mapping[str, type], short: ShortVectors | None) -> Any:
+def map_of_table(table: Any) -> VectorMap:
+    """Read what `map_to_table` wrote."""
+    file = io.BytesIO(table["arrays"][0].as_py())
+    with np.load(file, allow_pickle=False) as arrays:
+        return VectorMap.of_arrays(arrays)
+
+
+def rows_of(descriptions: Tensor) -> Singles:
+    """Return descriptions (N, ...) as an array (N, F)."""
+    rows: Singles = descriptions.flatten(1).cpu().float().numpy()
+    return rows
+
+
+def encoded(batch: Batch, columns: Mapping[str, type], short: VectorMap | None) -> Any:
     """Return an Arrow table of metadata, of descriptions in `vector`, and of short vectors in `short`.
 
     Long descriptions are stored in half precision, which keeps each number to 0.05 %. The last component of a vector is
     the power of two that the others are multiplied by.
     """
     descriptions, rows = batch
-    values = descriptions.flatten(1).cpu().float().numpy()
+    values = rows_of(descriptions)
     if not np.isfinite(values).all():
         raise ValueError(
             "descriptions: expected finite numbers, got NaN or infinity. Find the mesh that causes them."
@@ -78,7 +62,7 @@ def encoded(batch: Batch, columns: Mapping[str, type], short: ShortVectors | Non
     table = _with_list(table, "vector", _scaled(values))
     if short is not None:
         # LanceDB's index leaves out rows without a vector, so that none may come without
-        table = _with_list(table, "short", short(descriptions), nullable=False)
+        table = _with_list(table, "short", short(values), nullable=False)
     return table
 
 

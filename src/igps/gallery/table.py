@@ -3,7 +3,7 @@
 The table lies in a folder or in an object store. In a folder, writers wait for each other. Data left by a killed
 process are part of no version.
 
-A large table has short vectors beside the descriptions (see `ShortVectors`). LanceDB's index of them finds a few
+A large table has short vectors beside the descriptions (see `VectorMap`). LanceDB's index of them finds a few
 hundred candidates, which are ranked by the distance between full descriptions.
 """
 
@@ -25,7 +25,7 @@ from igps._threads import one_thread
 from igps.gallery.columns import KNOWN, Batch, Found, Row
 from igps.gallery.place import address, is_remote
 from igps.retrieval.distances import Distance
-from igps.retrieval.vectors import SearchDistance
+from igps.retrieval.vectors import SearchDistance, VectorMap
 
 try:
     import lancedb
@@ -34,11 +34,13 @@ try:
 
     from igps.gallery._encoding import (
         ARROW_TYPES,
-        ShortVectors,
         decoded,
         encoded,
         head_of,
         kinds_of,
+        map_of_table,
+        map_to_table,
+        rows_of,
         with_head,
     )
 except ImportError as error:
@@ -91,10 +93,10 @@ class BodyTable:
             self.about: dict[str, Any] = self.head["about"]
             self.shape: tuple[int, ...] = tuple(self.head["shape"])
             self.columns = kinds_of(schema)
-            self.short: ShortVectors | None = None
+            self.short: VectorMap | None = None
             if self.head["map"]:
                 stored = _database(self.path).open_table(self.head["map"])
-                self.short = ShortVectors.of_table(stored.to_arrow())
+                self.short = map_of_table(stored.to_arrow())
 
     def __len__(self) -> int:
         return int(self.table.count_rows())
@@ -161,7 +163,7 @@ class BodyTable:
     def _candidates(self, query: Tensor, n: int, where: str | None) -> Any:
         """Return an Arrow table of the n rows with the short vectors nearest to that of a query (1, ...)."""
         assert self.short is not None
-        vector = self.short(query)[0]
+        vector = self.short(rows_of(query))[0]
         n_probes = max(_MIN_PROBES, int(_MIN_SHARE * _n_partitions(len(self))))
         with self._translated_errors(where):
             request = self.table.search(vector, vector_column_name="short").distance_type("l2")
@@ -316,9 +318,9 @@ def _overwrite(
     database = _database(path)
     short = name = None
     if head["searched_by"] and len(sample) >= _MIN_ROWS_FOR_INDEX:
-        short = ShortVectors.fit(sample, head["searched_by"], head["weights"])
+        short = VectorMap.fit(rows_of(sample), head["searched_by"], head["weights"])
         name = _MAP + secrets.token_hex(8)
-        database.create_table(name, short.to_table())
+        database.create_table(name, map_to_table(short))
     example = encoded((sample[:1], [{}]), columns, short)
     schema = with_head(example.schema, {**head, "map": name})
 

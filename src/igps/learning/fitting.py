@@ -298,7 +298,7 @@ class _Fitting:
         self, rows: Tensor, labels: Tensor, candidates: Sequence[Candidate]
     ) -> dict[str, float]:
         """Return the means over held-out folds of the retrieval scores and, for a classifier, classification scores."""
-        from torchmetrics.functional.classification import binary_auroc
+        from sklearn.metrics import roc_auc_score
 
         retrieval: list[dict[str, float]] = []
         probabilities = []
@@ -328,7 +328,7 @@ class _Fitting:
                 assert isinstance(partial, ClassifyingHead)
                 strangeness = torch.cat([partial.strangeness(x[mask]) for mask in (unknown, known)])
                 is_unknown = torch.arange(len(strangeness)) < int(unknown.sum())
-                unknown_aucs.append(float(binary_auroc(strangeness, is_unknown.long())))
+                unknown_aucs.append(float(roc_auc_score(is_unknown, strangeness)))
         means = {
             score: fmean(scores[score] for scores in retrieval)
             for score in (retrieval[0] if retrieval else ())
@@ -371,16 +371,19 @@ def classification_scores(
         classes: (C,) numbers of all classes, ascending.
     """
     from sklearn.metrics import roc_auc_score
-    from torchmetrics.functional.classification import multiclass_calibration_error
 
     targets = torch.searchsorted(classes, labels)
     is_right = probabilities.argmax(dim=1) == targets
     present = targets.unique().tolist()
-    error = multiclass_calibration_error(probabilities, targets, len(classes), _N_BINS)
+    confidences = probabilities.amax(dim=1)
+    bins = (confidences * _N_BINS).long()
+    gaps = confidences.new_zeros(_N_BINS + 1).index_add(
+        0, bins, confidences - is_right.to(confidences)
+    )
     scores = {
         "accuracy": float(is_right.float().mean()),
         "balanced_accuracy": fmean(float(is_right[targets == c].float().mean()) for c in present),
-        "calibration_error": float(error),
+        "calibration_error": float(gaps.abs().sum() / len(targets)),
     }
     if len(present) > 1:
         areas = [roc_auc_score(targets == c, probabilities[:, c]) for c in present]

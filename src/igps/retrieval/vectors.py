@@ -1,5 +1,6 @@
 """Short vectors of descriptions, for search engines that support Euclidean distances alone."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -28,30 +29,41 @@ class VectorMap:
     """
 
     searched_by: SearchDistance  # the distance of the descriptions
+    weights: Singles | None = (
+        None  # (F,) factors of the descriptions, see `Descriptor.search_weights`
+    )
     # (F,) of the descriptions or their features; None if descriptions stay as they are
     mean: Singles | None = None
     components: Singles | None = None  # (D, F) principal directions, orthonormal
 
     @classmethod
-    def fit(cls, descriptions: Singles, searched_by: SearchDistance, seed: int = 0) -> Self:
+    def fit(
+        cls,
+        descriptions: Singles,
+        searched_by: SearchDistance,
+        weights: Sequence[float] | None = None,
+        seed: int = 0,
+    ) -> Self:
         """Fit a map to example descriptions (N, F); a few thousand are enough."""
+        factors = None if weights is None else np.asarray(weights, np.float32)
+        plain = cls(searched_by, factors)
         if searched_by == "cosine" and descriptions.shape[1] <= MAX_SHORT_WIDTH:
-            return cls(searched_by)
+            return plain
         from sklearn.decomposition import PCA
 
-        features = _features(descriptions, searched_by)
+        features = plain._features(descriptions)
         n_components = min(MAX_SHORT_WIDTH, *features.shape)
         solver = "randomized" if n_components < min(features.shape) else "full"
         pca = PCA(n_components, svd_solver=solver, random_state=seed).fit(features)
-        return cls(searched_by, pca.mean_.astype(np.float32), pca.components_.astype(np.float32))
+        mean = pca.mean_.astype(np.float32)
+        return cls(searched_by, factors, mean, pca.components_.astype(np.float32))
 
     def __call__(self, descriptions: Singles) -> Singles:
         """(N, F) descriptions to (N, D) vectors."""
         if self.components is None or self.mean is None:
-            return np.ascontiguousarray(descriptions, dtype=np.float32)
+            return np.ascontiguousarray(self._features(descriptions), dtype=np.float32)
         blocks = [
-            (_features(descriptions[i : i + _BLOCK_ROWS], self.searched_by) - self.mean)
-            @ self.components.T
+            (self._features(descriptions[i : i + _BLOCK_ROWS]) - self.mean) @ self.components.T
             for i in range(0, len(descriptions), _BLOCK_ROWS)
         ]
         return np.concatenate([*blocks, np.zeros((0, len(self.components)), dtype=np.float32)])
@@ -63,13 +75,15 @@ class VectorMap:
     @classmethod
     def of_arrays(cls, arrays: Any) -> Self:
         """Restore a map from its `arrays`."""
-        fields = {name: arrays[name] for name in ("mean", "components") if name in arrays}
+        fields = {
+            name: arrays[name] for name in ("weights", "mean", "components") if name in arrays
+        }
         return cls(str(arrays["searched_by"]), **fields)  # type: ignore[arg-type]
 
+    def _features(self, descriptions: Singles) -> Singles:
+        weighted = descriptions if self.weights is None else descriptions * self.weights
+        if self.searched_by == "cosine":
+            return weighted
+        from sklearn.kernel_approximation import AdditiveChi2Sampler
 
-def _features(descriptions: Singles, searched_by: SearchDistance) -> Singles:
-    if searched_by == "cosine":
-        return descriptions
-    from sklearn.kernel_approximation import AdditiveChi2Sampler
-
-    return AdditiveChi2Sampler(sample_steps=_SAMPLE_STEPS).fit_transform(descriptions)
+        return AdditiveChi2Sampler(sample_steps=_SAMPLE_STEPS).fit_transform(weighted)

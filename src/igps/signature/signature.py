@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -148,10 +148,6 @@ class Signature:
         squares = np.square(self.interior.eigenfunctions, dtype=np.float64)
         potential = squares @ (1 / self.eigenvalues)
         return self.interior.points[int(np.argmin(potential))]
-
-    def map_samples(self, change: Callable[[Samples], Samples]) -> Signature:
-        """Return the Signature with a function applied to its interior and to its surface samples."""
-        return replace(self, interior=change(self.interior), surface=change(self.surface))
 
 
 @one_thread()
