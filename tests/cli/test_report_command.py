@@ -11,8 +11,8 @@ import pytest
 
 from commands import run
 from igps.report.page import render_page
-from igps.report.results import read_results
-from igps.report.surfaces import read_surfaces
+from igps.report.results import read_results, read_sources
+from igps.report.surfaces import surfaces_of
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, write_egg
 
@@ -70,8 +70,10 @@ def test_retrieve_with_its_page(
         },
         abs=1e-5,
     )
-    kept = read_surfaces(out / "surfaces.npz")
-    assert (out / "report.html").read_text("utf-8") == render_page(read_results(out), kept)
+    dataset = read_sources(out)
+    assert dataset is not None
+    found = surfaces_of(dataset, n_workers=1)
+    assert (out / "report.html").read_text("utf-8") == render_page(read_results(out), found)
     assert not re.search(re.escape(str(tmp_path)), (out / "report.html").read_text("utf-8"))
 
 
@@ -81,7 +83,6 @@ def test_a_page_afterwards_wherever_the_meshes_are(
     out = retrieved
     page = tmp_path / "pages" / "mine.html"
     assert not (out / "report.html").exists()
-    assert not (out / "surfaces.npz").exists()
     moved = root.rename(tmp_path / "moved")
 
     def n_pictures(*more: object) -> int:
@@ -91,8 +92,6 @@ def test_a_page_afterwards_wherever_the_meshes_are(
     assert n_pictures() == 0
     assert n_pictures("--meshes", moved) == 4
     (out / "meshes.json").unlink()  # as in results of before there was one
-    assert n_pictures() == 4
-    (out / "surfaces.npz").unlink()
     assert n_pictures() == 0
     assert len(data_of(page)["shapes"]) == 4
 
@@ -178,4 +177,5 @@ def test_bodies_named_by_a_table_elsewhere_have_pictures(
     monkeypatch.chdir("/")
     run(monkeypatch, "report", tmp_path / "out", "--n_workers", 1)
     names = {f"{subject}.nii.gz#{body}" for subject in range(2) for body in ("block", "bar")}
-    assert set(read_surfaces(tmp_path / "out" / "surfaces.npz")) == names
+    shapes = data_of(tmp_path / "out" / "report.html")["shapes"]
+    assert {shape["name"] for shape in shapes if "surface" in shape} == names

@@ -11,10 +11,8 @@ from igps.report import surfaces
 from igps.report.surfaces import (
     clustered,
     fitting_vertices,
-    keep_surfaces,
-    read_surfaces,
     surface_of,
-    write_surfaces,
+    surfaces_of,
 )
 from igps.signature.signature import SignatureConfig, compute_signature
 
@@ -104,61 +102,42 @@ def test_where_quadrics_fail_clusters_serve(monkeypatch):
     assert 40 < len(surface_of(mesh, compute_signature(mesh, CONFIG), 150).vertices) <= 150
 
 
-def test_written_and_read_again(tmp_path):
-    path = tmp_path / "surfaces.npz"
-    assert read_surfaces(path) == {}
-    mesh = as_mesh(egg())
-    signature = compute_signature(mesh, CONFIG)
-    written = {"a": surface_of(mesh, signature, 100, "key"), "ü": surface_of(mesh, signature, 300)}
-    write_surfaces(path, written)
-    found = read_surfaces(path)
-    assert list(found) == ["a", "ü"]
-    for name, one in written.items():
-        assert one.packed() == found[name].packed()
-        for field in ("potential_range", "n_vertices", "n_faces", "area", "volume", "key"):
-            assert getattr(one, field) == getattr(found[name], field)
-    write_surfaces(path, {})
-    assert read_surfaces(path) == {}
-    np.savez(path, names=np.array(["a"]))
-    with pytest.raises(ValueError, match="igps-surfaces-3"):
-        read_surfaces(path)
-
-
-def test_kept_surfaces_follow_their_files(tmp_path, caplog):
-    """Made once, again where the file changed, kept where it is gone; one that cannot be read has none."""
+def test_surfaces_of_the_cache_follow_their_files(tmp_path, caplog):
+    """Made once, and again where the file changed; one that cannot be read has none."""
     files = [tmp_path / f"{i}.off" for i in range(3)]
     for i, file in enumerate(files):
         surface = egg()
         surface.vertices *= [1, 1, 1 - 0.1 * i]
         surface.export(file)
-    kept = tmp_path / "surfaces.npz"
 
-    def keep():
+    def found():
         dataset = SignatureDataset(files, CONFIG, tmp_path / "cache")
-        return {
-            Path(name).name: one for name, one in keep_surfaces(kept, dataset, n_workers=1).items()
-        }
+        return {Path(name).name: one for name, one in surfaces_of(dataset, n_workers=1).items()}
 
-    first = keep()
+    def stamps():
+        files = (tmp_path / "cache" / "pictures").rglob("*.safetensors")
+        return {file: file.stat().st_mtime_ns for file in files}
+
+    first = found()
     assert list(first) == ["0.off", "1.off", "2.off"]
-    time_made = kept.stat().st_mtime_ns
-    assert {name: one.key for name, one in keep().items()} == {
-        name: one.key for name, one in first.items()
-    }
-    assert kept.stat().st_mtime_ns == time_made
+    kept = stamps()
+    again = found()
+    assert len(kept) == 3
+    assert stamps() == kept
+    for name, one in first.items():
+        assert one.packed() == again[name].packed()
+        for field in ("potential_range", "n_vertices", "n_faces", "area", "volume", "unit"):
+            assert getattr(one, field) == getattr(again[name], field)
 
     changed = egg()
     changed.vertices *= [1, 1, 0.5]
     changed.export(files[0])
     files[1].unlink()
-    second = keep()
-    assert second["0.off"].volume == pytest.approx(changed.volume)
-    assert second["0.off"].volume < 0.6 * first["0.off"].volume
-    assert second["1.off"].packed() == first["1.off"].packed()
-
     files[2].write_text("no mesh")
-    kept.unlink()
-    assert list(keep()) == ["0.off"]
+    second = found()
+    assert list(second) == ["0.off"]
+    assert second["0.off"].volume == pytest.approx(changed.volume)
+    assert "1.off: no picture" in caplog.text
     assert "2.off: no picture" in caplog.text
 
 

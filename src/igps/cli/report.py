@@ -14,8 +14,7 @@ def report(
     """Make a page of results for the browser, a single self-contained HTML file.
 
     The page shows rankings, scores, a map of the bodies, and the results of igps groups and igps outliers in the same
-    folder. Simplified surfaces for the pictures are stored in the folder, in surfaces.npz; a mesh that no longer exists
-    when they are computed has no picture.
+    folder. A mesh that no longer exists has no picture.
 
     Args:
         results: folder that igps retrieve or igps compare wrote (--out).
@@ -25,18 +24,13 @@ def report(
     """
     from igps.report.page import render_page
     from igps.report.results import read_results, read_sources
-    from igps.report.surfaces import keep_surfaces, read_surfaces
+    from igps.report.surfaces import surfaces_of
 
     if meshes is not None and not meshes.is_dir():
         raise FileNotFoundError(f"meshes: {meshes}: no such folder. Check the path.")
     dataset = read_sources(results, meshes)
     contents = read_results(results)
-    stored = results / "surfaces.npz"
-    surfaces = (
-        read_surfaces(stored)
-        if dataset is None
-        else keep_surfaces(stored, dataset, n_workers=n_workers)
-    )
+    surfaces = {} if dataset is None else surfaces_of(dataset, n_workers=n_workers)
     page = out or results / "report.html"
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(render_page(contents, surfaces), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Cache of Signatures, attributes, descriptions, failures and listings: one safetensors file for each key."""
+"""Cache of Signatures, attributes, descriptions, failures, listings and pictures: one safetensors file for each key."""
 
 import json
 import logging
@@ -20,7 +20,7 @@ from igps.signature.signature import SAMPLE_KINDS, Samples, Signature, Signature
 
 logger = logging.getLogger(__name__)
 
-Kind = Literal["signature", "attribute", "description", "failure", "listing"]
+Kind = Literal["signature", "attribute", "description", "failure", "listing", "picture"]
 
 _FORMAT = "igps-cache-3"
 # Fields of a Signature besides arrays and configuration

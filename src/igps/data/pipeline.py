@@ -216,10 +216,10 @@ class SignaturePipeline:
             # Transforms seed random numbers by the name, so copies of a file get the same numbers only by its key
             changed = self.pre_transform(replace(signature, name=keys.key))
             signature = replace(changed, name=signature.name)
-            self._put("signature", self._keys(body, content).key, encode(signature))
+            self.put("signature", self._keys(body, content).key, encode(signature))
         return signature
 
-    def _put(self, kind: Kind, key: str, record: Record) -> None:
+    def put(self, kind: Kind, key: str, record: Record) -> None:
         """Store a record; if it cannot be stored, only warn where the cache is not needed."""
         try:
             self.cache(kind).put(key, record)
@@ -242,7 +242,7 @@ class SignaturePipeline:
         except MeshError as error:
             self._remember(body, content, error)
             raise
-        self._put("signature", key, encode(signature))
+        self.put("signature", key, encode(signature))
         return signature
 
     def _attribute(
@@ -260,7 +260,7 @@ class SignaturePipeline:
         values: dict[Any, Singles] = {
             kind: getattr(checked, kind).attributes[name] for kind in SAMPLE_KINDS
         }
-        self._put("attribute", key, Record(values))
+        self.put("attribute", key, Record(values))
         return values
 
     def _failure_key(self, body: BodyRef, content: Content) -> str:
@@ -273,7 +273,7 @@ class SignaturePipeline:
         if body in self.meshes or isinstance(error.__cause__, OSError):
             return
         record = Record({}, {"reason": str(error), "summary": error.summary})
-        self._put("failure", self._failure_key(body, content), record)
+        self.put("failure", self._failure_key(body, content), record)
 
 
 def _values_of(record: Record) -> dict[SampleKind, Singles]:

@@ -1,11 +1,11 @@
 """Simplified surfaces for the page of results: few vertices, quantised, with the barycentroid potential."""
 
 import contextlib
+import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,9 @@ from scipy.spatial import cKDTree
 from igps._arrays import Floats, Integers
 from igps._parallel import run
 from igps._progress import Progress
+from igps.data.cache import Record
 from igps.data.dataset import SignatureDataset
+from igps.data.keys import derived_key
 from igps.data.pipeline import SignaturePipeline
 from igps.failures import Failed
 from igps.mesh._collapse_loops import collapse_edges
@@ -28,12 +30,13 @@ from igps.signature.signature import Signature
 
 logger = logging.getLogger(__name__)
 
-_FORMAT = "igps-surfaces-3"
+_VERSION = 4  # raise it whenever other surfaces come out
 _MAX_VERTICES, _MIN_VERTICES = 1200, 150  # of one surface
 # Size of all surfaces of a page, and of one vertex, which has 19 bytes as text in base 64
 _MAX_BYTES = 20e6
 _BYTES_PER_VERTEX = 19 * 4 / 3
 _STEPS = 2**16 - 1  # along each axis of the cube in which vertices are quantised
+_ARRAYS = ("vertices", "faces", "potential")
 _N_NEIGHBOURS = 4  # samples whose mean is the potential of a vertex
 
 
@@ -50,7 +53,6 @@ class PageSurface:
     n_faces: int
     area: float  # length²
     volume: float  # length³
-    key: str  # cache key of the Signature, which changes with the mesh file
     unit: str | None = None  # of length, such as "mm"; None if unknown
     frame: Frame = None  # "RAS" if x points to the patient's left, y up and z to the front
 
@@ -67,28 +69,25 @@ def fitting_vertices(n_shapes: int) -> int:
     )
 
 
-def keep_surfaces(
-    path: Path, dataset: SignatureDataset, *, n_workers: int | None = None
+def surfaces_of(
+    dataset: SignatureDataset, *, n_workers: int | None = None
 ) -> dict[str, PageSurface]:
-    """Return the surfaces of meshes by name, from an archive where possible; compute and store the others.
-
-    The surface of a mesh file that has changed is computed again; that of a deleted file is used from the archive. A
-    mesh that cannot be read and is not in the archive is logged and left out.
-    """
-    stored = read_surfaces(path)
-    names = dataset.bodies.names
-    bodies = dataset.bodies
-    missing = [
-        i
-        for i, name in enumerate(names)
-        if not _is_current(dataset.pipeline, bodies[i], stored.get(name))
-    ]
+    """Return the surfaces of bodies by name, from the cache if possible; a body that fails is logged and left out."""
+    n_vertices = fitting_vertices(len(dataset))
+    surfaces: dict[str, PageSurface] = {}
+    missing: dict[str, BodyRef] = {}
+    for name, body in zip(dataset.bodies.names, dataset.bodies, strict=True):
+        found = None
+        with contextlib.suppress(MeshError):  # which the computation reports
+            key = _key(dataset.pipeline, n_vertices, body)
+            found = dataset.pipeline.cache("picture").get(key, _decoded)
+        if found is None:
+            missing[name] = body
+        else:
+            surfaces[name] = found
     if missing:
-        make = partial(_surface_of_body, dataset.pipeline, fitting_vertices(len(names)))
-        stored |= _made(make, {names[i]: bodies[i] for i in missing}, n_workers)
-    surfaces = {name: stored[name] for name in names if name in stored}
-    if missing:
-        write_surfaces(path, surfaces)
+        make = partial(_surface_of_body, dataset.pipeline, n_vertices)
+        surfaces |= _made(make, missing, n_workers)
     return surfaces
 
 
@@ -108,10 +107,29 @@ def _made(
 
 
 def _surface_of_body(pipeline: SignaturePipeline, n_vertices: int, body: BodyRef) -> PageSurface:
-    return surface_of(pipeline.mesh(body), pipeline.signature(body), n_vertices, pipeline.key(body))
+    key = _key(pipeline, n_vertices, body)
+    surface = surface_of(pipeline.mesh(body), pipeline.signature(body), n_vertices)
+    pipeline.put("picture", key, _encoded(surface))
+    return surface
 
 
-def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "") -> PageSurface:
+def _key(pipeline: SignaturePipeline, n_vertices: int, body: BodyRef) -> str:
+    return derived_key("picture", pipeline.key(body), n_vertices, _VERSION)
+
+
+def _encoded(surface: PageSurface) -> Record:
+    facts = dict(vars(surface))
+    arrays = {name: facts.pop(name) for name in _ARRAYS}
+    return Record(arrays, {"facts": json.dumps(facts)})
+
+
+def _decoded(record: Record) -> PageSurface:
+    facts = json.loads(record.texts["facts"])
+    facts["potential_range"] = tuple(facts["potential_range"])
+    return PageSurface(**{name: record.arrays[name] for name in _ARRAYS}, **facts)
+
+
+def surface_of(mesh: Mesh, signature: Signature, n_vertices: int) -> PageSurface:
     """Return a surface of at most `n_vertices` vertices, with the potential interpolated from surface samples."""
     vertices = mesh.vertices
     faces = mesh.faces
@@ -145,7 +163,6 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
         len(mesh.faces),
         mesh.area,
         mesh.volume,
-        key,
         mesh.unit,
         mesh.frame,
     )
@@ -156,80 +173,6 @@ def page_axes(mesh: Mesh, samples: Floats) -> Floats:
     if mesh.frame == "RAS":
         return patient_views()[0].axes
     return axes_of(samples)
-
-
-def write_surfaces(path: Path, surfaces: Mapping[str, PageSurface]) -> None:
-    """Write surfaces to a NumPy archive, as concatenated arrays with the sizes of each surface."""
-    values = list(surfaces.values())
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(
-        path,
-        format=np.array(_FORMAT),
-        names=np.array(list(surfaces), dtype=str),
-        keys=np.array([s.key for s in values], dtype=str),
-        units=np.array([s.unit or "" for s in values], dtype=str),
-        frames=np.array([s.frame or "" for s in values], dtype=str),
-        vertices=np.concatenate([np.empty((0, 3), np.uint16), *(s.vertices for s in values)]),
-        faces=np.concatenate([np.empty((0, 3), np.uint16), *(s.faces for s in values)]),
-        potential=np.concatenate([np.empty(0, np.uint8), *(s.potential for s in values)]),
-        counts=np.array([(len(s.vertices), len(s.faces)) for s in values]).reshape(-1, 2),
-        mesh_counts=np.array([(s.n_vertices, s.n_faces) for s in values]).reshape(-1, 2),
-        measures=np.array([(*s.potential_range, s.area, s.volume) for s in values]).reshape(-1, 4),
-    )
-
-
-def read_surfaces(path: Path) -> dict[str, PageSurface]:
-    """Read an archive of `write_surfaces`, by name; return an empty dictionary if there is no file.
-
-    Raises:
-        ValueError: the file has another format.
-    """
-    if not path.is_file():
-        return {}
-    with np.load(path) as archive:
-        if "format" not in archive or str(archive["format"]) != _FORMAT:
-            raise ValueError(
-                f"{path}: expected an archive of the format {_FORMAT}. Delete it and run again."
-            )
-        arrays = {name: archive[name] for name in archive}
-    ends = np.cumsum(arrays["counts"], axis=0)
-    columns = [
-        np.split(arrays[name], ends[:, i])[:-1]
-        for name, i in (("vertices", 0), ("faces", 1), ("potential", 0))
-    ]
-    columns += [
-        arrays[name].tolist()
-        for name in ("names", "measures", "mesh_counts", "keys", "units", "frames")
-    ]
-    return {
-        name: PageSurface(
-            vertices,
-            faces,
-            potential,
-            (low, high),
-            n_v,
-            n_f,
-            area,
-            volume,
-            key,
-            unit or None,
-            frame or None,
-        )
-        for vertices, faces, potential, name, (low, high, area, volume), (
-            n_v,
-            n_f,
-        ), key, unit, frame in zip(*columns, strict=True)
-    }
-
-
-def _is_current(pipeline: SignaturePipeline, body: BodyRef, stored: PageSurface | None) -> bool:
-    """Return whether a stored surface can be used: the file is unchanged, or it was deleted."""
-    if stored is None:
-        return False
-    try:
-        return pipeline.key(body) == stored.key
-    except MeshError:
-        return True
 
 
 def clustered(vertices: Floats, faces: Integers, n_vertices: int) -> tuple[Floats, Integers]:
