@@ -13,8 +13,8 @@ from sklearn.utils.validation import check_is_fitted
 from igps._arrays import Singles
 from igps.analysis.inside import column_names
 from igps.analysis.inside_collection import inside_config, inside_table
+from igps.data.added_attributes import AttributeSource
 from igps.data.attribute_sources import attribute_sources
-from igps.data.attributes import AttributeSource
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of

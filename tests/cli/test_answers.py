@@ -20,7 +20,7 @@ from igps.analysis.outliers import LIMIT
 from igps.cli.answers import _extent
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
-from igps.report.answers import clusters_figure, map_figure, write_analysis
+from igps.report.figures import clusters_figure, map_figure, write_analysis
 from igps.retrieval import chi_square
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior, write_egg

@@ -11,8 +11,8 @@ import pytest
 
 from commands import run
 from igps.report.page import render_page
+from igps.report.pictures import surfaces_of
 from igps.report.results import read_results, read_sources
-from igps.report.surfaces import surfaces_of
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, write_egg
 

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from igps.report.surfaces import surface_of
+from igps.report.pictures import surface_of
 from igps.signature.signature import SignatureConfig, compute_signature
 
 EVIL = "<script>window.ran = 1</script>"

@@ -33,8 +33,8 @@ from conftest import as_mesh
 from igps.analysis.clusters import clusters_of
 from igps.analysis.map import body_map
 from igps.report.page import render_page
+from igps.report.pictures import surface_of
 from igps.report.results import Results, System, read_results
-from igps.report.surfaces import surface_of
 from igps.shapes import ArticulatedShapes
 from igps.signature.signature import SignatureConfig, compute_signature
 

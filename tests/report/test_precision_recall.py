@@ -4,19 +4,19 @@ import numpy as np
 import torch
 from matplotlib.image import imread
 
-from igps.report import answers
+from igps.report import figures
 from igps.retrieval import precision_recall_curve
 
 
 def test_curves_are_drawn_in_percent_and_told_apart(tmp_path, figures_of):
-    made = figures_of(answers)
+    made = figures_of(figures)
     labels = [0, 0, 0, 1, 1, 1]
     draws = np.random.default_rng(0).random((12, 6, 6))
     curves = {
         f"descriptor {i}": precision_recall_curve(torch.from_numpy(draw), labels)
         for i, draw in enumerate(draws)
     }
-    answers.precision_recall(curves, tmp_path / "deep" / "curves.png")
+    figures.precision_recall(curves, tmp_path / "deep" / "curves.png")
     (axes,) = made[0].axes
     assert len(axes.lines) == 12
     for line, (name, curve) in zip(axes.lines, curves.items(), strict=True):

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from igps._arrays import Floats, Integers
-from igps.data.places import Correspondence, Places, correspondence
+from igps.data.correspondence import Correspondence, Places, correspondence
 from igps.mesh.loading import BodyRef
 
 # On 111 chains with one or two domains turned by 20 to 60 degrees, and the rest bent by 0.8 Å, 95 % of the squared

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from igps.cli.reading import Described, Folder
     from igps.data.dataset import SignatureDataset
     from igps.data.sources import Bodies
-    from igps.report.answers import Painted
+    from igps.report.figures import Painted
 
 
 CALIBRATED = "pretrained"
@@ -68,7 +68,7 @@ def groups(
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import keeps_size
     from igps.mesh.mesh import millimetres
-    from igps.report.answers import LEVEL, groups_figure, write_analysis
+    from igps.report.figures import LEVEL, groups_figure, write_analysis
     from igps.report.tables import groups_table
 
     check_at_least(1, n_permutations=n_permutations)
@@ -173,8 +173,8 @@ def _write_places(
     from igps.cli.places import places_of_groups
     from igps.descriptors.size_and_side import SIZE
     from igps.mesh.errors import MeshError
-    from igps.report.answers import painted_figure, write_painted
     from igps.report.drawing import file_names, save_figure
+    from igps.report.figures import painted_figure, write_painted
 
     if not members:
         return
@@ -233,7 +233,7 @@ def outliers(
     from igps.analysis.outliers import outliers as find_outliers
     from igps.cli.reading import Folder, described, print_failures
     from igps.fields.volumes.border import border_of
-    from igps.report.answers import outliers_figure, write_analysis
+    from igps.report.figures import outliers_figure, write_analysis
 
     check_at_least(0, top=top)
     result = described(Folder(root, labelled=True), descriptor, **describing)
@@ -326,8 +326,8 @@ def explain(
     from igps.cli.reading import Folder, check_files, files_or_folder
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.with_attributes import split_attributes
-    from igps.report.answers import painted_figure, write_analysis, write_movement, write_painted
     from igps.report.drawing import file_names
+    from igps.report.figures import painted_figure, write_analysis, write_movement, write_painted
 
     check_fraction(level=level)
     if axis not in (None, 1, 2):
@@ -387,8 +387,8 @@ def explain(
 
 def _write_attributes(out: Path, found: _Explained) -> None:
     """Write the share of each attribute back on both bodies: tables, slices, and files for viewers."""
-    from igps.report.answers import slices_figure, write_analysis, write_painted
     from igps.report.drawing import file_names
+    from igps.report.figures import slices_figure, write_analysis, write_painted
 
     legend = "share of the distance, over that of an even spread"
     for name, told in found.attributes.items():
@@ -579,7 +579,7 @@ def _two_groups(bodies: Bodies, group: str | None) -> Any:
 def _painted(dataset: SignatureDataset, i: int, explanation: Explanation, side: int) -> Painted:
     """Return a body with the shares of its vertices in the distance, over those of an even spread; `side` is 0 or 1."""
     from igps.analysis.explanation import share_density
-    from igps.report.answers import Painted
+    from igps.report.figures import Painted
     from igps.signature.signature import SAMPLE_KINDS
 
     mesh = dataset.mesh(i)
@@ -594,7 +594,7 @@ def _painted(dataset: SignatureDataset, i: int, explanation: Explanation, side: 
 def _painted_inside(dataset: SignatureDataset, i: int, shares: Any, distance: float) -> Painted:
     """Return a body with the shares (P,) of its interior samples in a distance, over those of an even spread."""
     from igps.analysis.explanation import share_density
-    from igps.report.answers import Painted
+    from igps.report.figures import Painted
 
     mesh = dataset.mesh(i)
     points = dataset[i].signature.interior.points

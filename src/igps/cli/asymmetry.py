@@ -36,7 +36,7 @@ def asymmetry(
     from igps.analysis.asymmetry import MIN_SUBJECTS, asymmetries, find_pairs
     from igps.cli.reading import Folder, described, print_failures
     from igps.fields.volumes.border import border_of
-    from igps.report.answers import write_analysis
+    from igps.report.figures import write_analysis
 
     check_at_least(0, top=top)
 

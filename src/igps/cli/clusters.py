@@ -42,7 +42,7 @@ def clusters(
     import numpy as np
 
     from igps.analysis.clusters import STABLE, clusters_of
-    from igps.report.answers import clusters_figure, write_analysis
+    from igps.report.figures import clusters_figure, write_analysis
 
     check_at_least(0, n_resamples=n_resamples)
     check_seed(seed)
@@ -120,7 +120,7 @@ def map_bodies(
     from igps.analysis.map import body_map, import_umap
     from igps.data.sources import LABELS_FILE
     from igps.mesh.mesh import millimetres
-    from igps.report.answers import map_figure, write_analysis
+    from igps.report.figures import map_figure, write_analysis
 
     def column_values(bodies: Bodies) -> list[str] | list[float]:
         """Return the column of labels.csv with the name `colour`; an empty list if the colour is not a column."""

@@ -51,7 +51,7 @@ def compare(
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import SIZE
     from igps.nn.description import fit_centres
-    from igps.report.answers import precision_recall
+    from igps.report.figures import precision_recall
     from igps.report.results import write_sources
     from igps.report.tables import comparison_table
     from igps.retrieval import precision_recall_curve

@@ -16,7 +16,7 @@ from igps.analysis.local_difference import (
 )
 from igps.data.dataset import SignatureDataset
 from igps.mesh.surface import vertex_areas
-from igps.report.answers import Painted
+from igps.report.figures import Painted
 
 _MAX_MISFIT = 0.03  # over √area; the smallest differences that are found reliably are a third of it
 

@@ -23,8 +23,8 @@ def report(
         n_workers: number of processes that make the pictures; by default one for each core.
     """
     from igps.report.page import render_page
+    from igps.report.pictures import surfaces_of
     from igps.report.results import read_results, read_sources
-    from igps.report.surfaces import surfaces_of
 
     if meshes is not None and not meshes.is_dir():
         raise FileNotFoundError(f"meshes: {meshes}: no such folder. Check the path.")

@@ -40,7 +40,7 @@ def trajectory(
     from igps.analysis.map import body_map
     from igps.cli.reading import check_files, described, print_failures
     from igps.fields.molecules.trajectories import write_frames
-    from igps.report.answers import map_figure, write_analysis
+    from igps.report.figures import map_figure, write_analysis
 
     check_at_least(1, step=step)
     if len(files) < 2:

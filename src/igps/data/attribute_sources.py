@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from igps._arrays import Floats
-from igps.data.attributes import AttributeSource
+from igps.data.added_attributes import AttributeSource
 from igps.data.grids import is_known
 from igps.data.keys import content_digest
 from igps.mesh.errors import MeshError

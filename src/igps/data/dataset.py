@@ -12,7 +12,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from igps.data.attributes import AttributeSource, PointFunction, split_attributes, with_attribute
+from igps.data.added_attributes import (
+    AttributeSource,
+    PointFunction,
+    split_attributes,
+    with_attribute,
+)
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.cache import default_cache_dir
 from igps.data.cache_hit import CacheHit

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from igps._arrays import Singles
+from igps.data.added_attributes import AttributeSource, with_attribute
 from igps.data.attribute_sources import with_load_options
-from igps.data.attributes import AttributeSource, with_attribute
 from igps.data.cache import Cache, Kind, Record, decode, encode
 from igps.data.cache_hit import CacheHit
 from igps.data.keys import Content, FileDigest, derived_key, signature_key

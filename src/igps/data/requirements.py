@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from torch import nn
 
-from igps.data.attributes import AttributeSource
+from igps.data.added_attributes import AttributeSource
 from igps.data.batch import SignatureBatch
 from igps.signature.attributes import AttributeName
 from igps.signature.signature import SignatureConfig

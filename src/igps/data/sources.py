@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from igps._files import delimiter_of, table_text
-from igps.data.attributes import AttributeSource, FileSource
+from igps.data.added_attributes import AttributeSource, FileSource
 from igps.data.listing import Listing
 from igps.mesh.formats import has_numbers, is_searched, searched_suffixes
 from igps.mesh.loading import BodyRef

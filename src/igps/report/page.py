@@ -7,8 +7,8 @@ from importlib.resources import files
 from typing import Any
 
 from igps.report.page_data import N_WORST, base64_text, data_of
+from igps.report.pictures import PageSurface
 from igps.report.results import Results
-from igps.report.surfaces import PageSurface
 from igps.report.tables import TITLES
 
 _TEMPLATE = files("igps.report") / "template"

@@ -11,8 +11,8 @@ import numpy as np
 from igps._arrays import Integers
 from igps.analysis.clusters import STABLE, clusters_of
 from igps.analysis.map import body_map
+from igps.report.pictures import PageSurface
 from igps.report.results import Results, System
-from igps.report.surfaces import PageSurface
 from igps.retrieval import RetrievalScores, precision_recall_curve, retrieval_scores
 
 N_WORST = 20

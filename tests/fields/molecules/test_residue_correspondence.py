@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from commands import run
-from igps.data.places import correspondence
+from igps.data.correspondence import correspondence
 from igps.fields.molecules.residue_correspondence import aligned
 from igps.fields.molecules.residues import VOLUMES
 from igps.mesh.loading import BodyRef

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from igps._arrays import Floats, Integers
-from igps.data.places import Correspondence, Places
+from igps.data.correspondence import Correspondence, Places
 from igps.fields.molecules._gemmi import gemmi_module
 from igps.fields.molecules.bodies import molecule_of, structure_of
 from igps.fields.molecules.molecule import Molecule

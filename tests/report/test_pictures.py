@@ -7,8 +7,8 @@ import trimesh
 from conftest import as_mesh, horseshoe
 from igps.data.dataset import SignatureDataset
 from igps.mesh.surface import components
-from igps.report import surfaces
-from igps.report.surfaces import (
+from igps.report import pictures
+from igps.report.pictures import (
     clustered,
     fitting_vertices,
     surface_of,
@@ -97,7 +97,7 @@ def test_clusters_are_means_of_cells():
 
 
 def test_where_quadrics_fail_clusters_serve(monkeypatch):
-    monkeypatch.setattr(surfaces, "collapse_edges", lambda vertices, faces, n: (vertices, faces))
+    monkeypatch.setattr(pictures, "collapse_edges", lambda vertices, faces, n: (vertices, faces))
     mesh = as_mesh(egg())
     assert 40 < len(surface_of(mesh, compute_signature(mesh, CONFIG), 150).vertices) <= 150
 
