@@ -54,7 +54,8 @@ def signature_of(molecule):
         found = {name: residue_attribute(molecule, samples.points, name) for name in names}
         return samples.with_attributes(found)
 
-    return compute_signature(surface, CONFIG).map_samples(added)
+    bare = compute_signature(surface, CONFIG)
+    return replace(bare, interior=added(bare.interior), surface=added(bare.surface))
 
 
 @cache

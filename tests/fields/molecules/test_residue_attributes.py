@@ -160,14 +160,9 @@ def test_a_signature_gets_attributes_and_keeps_its_own():
     few = {"n_eigenpairs": 10, "n_surface_samples": 50, "min_samples": 100}
     signature = compute_signature(mesh, SignatureConfig(attributes=("surface_direction",), **few))
     molecule = peptide("ASP", "LYS")
-
-    def charged(samples):
+    for samples in (signature.interior, signature.surface):
         charge = residue_attribute(molecule, samples.points, "charge")
-        return samples.with_attributes({"charge": charge})
-
-    found = signature.map_samples(charged)
-    for samples in (found.interior, found.surface):
-        assert set(samples.attributes) == {"surface_direction", "charge"}
-        expected = residue_attribute(molecule, samples.points, "charge")
-        np.testing.assert_allclose(samples.attributes["charge"], expected, rtol=1e-5, atol=1e-6)
+        found = samples.with_attributes({"charge": charge}).attributes
+        assert set(found) == {"surface_direction", "charge"}
+        np.testing.assert_allclose(found["charge"], charge, rtol=1e-5, atol=1e-6)
     assert set(signature.interior.attributes) == {"surface_direction"}
