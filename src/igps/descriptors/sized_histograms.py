@@ -4,17 +4,17 @@ import torch
 from torch import Tensor
 
 from igps.data.batch import SignatureBatch
+from igps.descriptors.size_and_side import add_size
 from igps.nn.descriptor import HistogramDescriptor
 from igps.retrieval import chi_square
-
-_HALF_SIZE = 0.3  # difference in size, in logarithms, at which half of the χ² distance counts
 
 
 class SizedHistograms(HistogramDescriptor):
     """Histograms and the size of a body.
 
-    The distance of two bodies is d·s / (0.3 + s), where d is the χ² distance of the histograms and s the difference in
-    size, |Δ log area| + |Δ log volume|. The last two numbers of a description are these logarithms.
+    The distance of two bodies is d + (d + n) s / 0.5 as in `SizeAndSide`, where d is the χ² distance of the
+    histograms, s the difference in size, |Δ log area| + |Δ log volume|, and n a quarter of the scale. The last two
+    numbers of a description are these logarithms.
     """
 
     search_distance = None
@@ -46,8 +46,9 @@ class SizedHistograms(HistogramDescriptor):
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) distances."""
-        size = torch.cdist(queries[:, -2:], gallery[:, -2:], p=1)
-        return chi_square(queries[:, :-2], gallery[:, :-2]) * size / (_HALF_SIZE + size)
+        differences = torch.cdist(queries[:, -2:], gallery[:, -2:], p=1)
+        distances = chi_square(queries[:, :-2], gallery[:, :-2])
+        return add_size(distances, differences, self.scale or 0.0)
 
     def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """(N, cells) square roots of the histograms, without the logarithms, which would dominate all distances."""

@@ -111,9 +111,13 @@ def test_size_is_a_factor_of_the_distance():
     without = described(one, larger, size=False)
     np.testing.assert_allclose(found[:, :-2], without)
     s = np.log(1.5) + np.log(2)
-    wanted = chi_square(without[:1], without[1:]) * s / (0.3 + s)
+    d = chi_square(without[:1], without[1:])
+    wanted = d + (d + molecular().scale / 4) * s / 0.5
     np.testing.assert_allclose(molecular().distances(found[:1], found[1:]), wanted, rtol=1e-4)
     assert float(molecular().distances(found[:1], found[:1])) == 0
+    # Of one size, molecules differ by their form
+    same_size = described(one, replace(other, area=one.area, volume=one.volume))
+    np.testing.assert_allclose(molecular().distances(*same_size.split(1)), d, rtol=1e-4)
 
 
 def test_statistics_compare_the_histograms_and_not_the_size():

@@ -24,6 +24,8 @@ _CENTRES = {
 # Distances change with the conformation, so the bins are wide.
 _N_BINS = 4
 _N_SAMPLES = 2000
+# The median distance between bends of one of three generated chains
+_SCALE = 0.021
 
 
 class Shares(PointAxis):
@@ -105,7 +107,7 @@ def molecular(*, size: bool = True) -> HistogramDescriptor:
         return Charges(axes, embedding, n_samples=_N_SAMPLES)
 
     kind = SizedHistograms if size else HistogramDescriptor
-    return kind(
+    histograms = kind(
         [
             Form([Potential(4), InteriorDistance(32)], embedding, n_samples=_N_SAMPLES),
             FoldHistogram(),
@@ -116,3 +118,5 @@ def molecular(*, size: bool = True) -> HistogramDescriptor:
         source="Rustamov 2010; Kyte and Doolittle 1982",
         invariant_to=("motion",),
     )
+    histograms.scale = _SCALE
+    return histograms
