@@ -14,13 +14,10 @@ from sklearn.utils.estimator_checks import check_estimator
 from igps.data.dataset import SignatureDataset
 from igps.descriptors.interior import interior
 from igps.descriptors.literature.d2 import D2
-from igps.descriptors.sized_histograms import SizedHistograms
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
-from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histograms.pairs import PairHistogram
 from igps.signature.signature import SignatureConfig
 from igps.sklearn import VolumetricFeatures
 
@@ -131,18 +128,6 @@ def test_descriptions_that_are_no_histograms_are_given_as_they_are(paths, tmp_pa
     expected = describe(SignatureDataset(paths[:2], CONFIG, tmp_path), D2(), n_workers=1)
     found = features.transform(paths[:2])
     np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
-def test_size_behind_histograms_is_no_histogram(paths, tmp_path):
-    sized = SizedHistograms([PairHistogram(embedding=SpectralEmbedding(n_eigenpairs=20))])
-    options = {"config": CONFIG, "cache_dir": tmp_path, "n_workers": 1}
-    found = VolumetricFeatures(sized, **options).fit(paths)
-    values = found.transform(paths[:1])
-    assert values.shape == (1, len(found.get_feature_names_out()))
-    ball = trimesh.load(paths[0])
-    expected = np.log([ball.area, ball.volume])
-    np.testing.assert_allclose(values[0, -2:], expected, rtol=1e-6)
-    np.testing.assert_allclose(np.square(values[0, :-2]).sum(), 1, rtol=1e-5)
 
 
 def test_reading_is_passed_on(paths, tmp_path):

@@ -13,7 +13,6 @@ from torch.utils.data import DataLoader
 
 from igps.data.collation import collate
 from igps.data.datamodule import SignatureDataModule
-from igps.fields.molecules.molecular import molecular
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor
@@ -339,12 +338,6 @@ def test_a_lazy_head_has_its_size_before_the_optimiser_is_made():
         assert not isinstance(one, torch.nn.UninitializedParameter)
     assert model.distance.head.layers[1].in_features == 3 * 16 + 9
     assert model.distance.head.training
-
-
-def test_size_beside_histograms_is_refused():
-    with pytest.raises(ValueError, match=r"molecular.*size.*without_size"):
-        RetrievalLearner(molecular(), BlendedDistance(WhitenedHead()))
-    RetrievalLearner(molecular().without_size(), BlendedDistance(WhitenedHead()))
 
 
 def test_any_module_describes(items, tmp_path):

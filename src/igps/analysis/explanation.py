@@ -232,7 +232,6 @@ def _n_cells(descriptor: Descriptor) -> int:
 
 def _part_shares(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
     """Sum the shares of cells for each histogram, and those of side and of size if the descriptor keeps these."""
-    n_cells = _n_cells(descriptor)
     sums: dict[str, float] = {}
     first = 0
     for _, part in _histograms(descriptor).histogram_shares:
@@ -240,15 +239,12 @@ def _part_shares(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
         first += part.n_cells
         name = part_name(part)
         sums[name] = sums.get(name, 0.0) + float(values.sum())
-    form = shares[None]
-    side = size = shares.new_empty(1, 0)
     if isinstance(descriptor, SizeAndSide):
-        form, side, size = descriptor.split(form)
-    size = torch.cat([form[:, n_cells:], size], dim=1)
-    if side.numel():
-        sums["side"] = float(side.sum())
-    if size.numel():
-        sums["size"] = float(size.sum())
+        _, side, size = descriptor.split(shares[None])
+        if side.numel():
+            sums["side"] = float(side.sum())
+        if size.numel():
+            sums["size"] = float(size.sum())
     return sums
 
 

@@ -147,8 +147,8 @@ class SizeAndSide(Descriptor):
         if self.twists is not None:
             distances = distances + euclidean(side, sides)
         if self.keeps_size:
-            differences = torch.cdist(size, sizes, p=1) / self._unit * _DOUBLING_SIZE
-            distances = add_size(distances, differences, self.scale)
+            share = torch.cdist(size, sizes, p=1) / self._unit  # s / 0.5
+            distances = distances + (distances + self._unit) * share
         return distances
 
     def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
@@ -241,12 +241,6 @@ def _log_sizes(batch: SignatureBatch) -> Tensor:
 def scale_of(descriptor: Descriptor) -> float | None:
     """Return the median distance between bodies of one class by a descriptor; None if it is not known."""
     return descriptor.scale or SCALES.get(descriptor.name)
-
-
-def add_size(distances: Tensor, differences: Tensor, scale: float) -> Tensor:
-    """Return distances d of a descriptor of this scale with differences s in size: d + (d + n) s / 0.5."""
-    unit = _INDIVIDUAL_SHARE * scale
-    return distances + (distances + unit) * differences / _DOUBLING_SIZE
 
 
 def keeps_size(size: Size, units: Sequence[str | None]) -> tuple[bool, str]:

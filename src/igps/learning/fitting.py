@@ -17,7 +17,6 @@ from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
 from igps.descriptors.size_and_side import SizeAndSide
-from igps.descriptors.sized_histograms import SizedHistograms
 from igps.descriptors.with_numbers import N_NUMBERS, Numbers, WithNumbers
 from igps.learning.shortcuts import shortcuts
 from igps.nn.description import check_centres, describe
@@ -74,12 +73,9 @@ class Classification:
 def split_head(which: str | Descriptor) -> tuple[Descriptor, Head | None]:
     """Return the histograms of a descriptor, to which heads are fitted, and its own head, if any."""
     module = descriptor_of(which)
-    module = module.without_size() if isinstance(module, SizedHistograms) else module
-    return (
-        (module.descriptor, module.head)
-        if isinstance(module, EmbeddedDescriptor)
-        else (module, None)
-    )
+    if isinstance(module, EmbeddedDescriptor):
+        return module.descriptor, module.head
+    return module, None
 
 
 def fit(
@@ -130,8 +126,7 @@ def fit(
     check_one_of(get_args(Goal), goal=goal)
     check_one_of(get_args(HeadName), head=head)
     module = descriptor_of(descriptor)
-    # Numbers that bypass the head
-    individual = {"size": isinstance(module, SizedHistograms), "side": False}
+    individual = {"size": False, "side": False}  # numbers that bypass the head
     if isinstance(module, SizeAndSide):
         individual = {"size": module.keeps_size, "side": module.twists is not None}
         module = module.descriptor

@@ -98,12 +98,6 @@ class RetrievalLearner(LightningModule):
         self.part_cells = (
             descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
         )
-        if isinstance(descriptor, HistogramDescriptor) and descriptor.n_features != sum(
-            descriptor.part_cells
-        ):
-            raise ValueError(
-                f"descriptor: expected only histograms, got {descriptor.name} with size. Use without_size()."
-            )
         if (
             distance.head is not None
             and self.part_cells is not None

@@ -15,7 +15,6 @@ from igps.fields.molecules.molecular_surface import molecular_surface
 from igps.fields.molecules.molecule import Molecule
 from igps.fields.molecules.residue_attributes import residue_attribute
 from igps.fields.molecules.residues import CHARGED_ATOMS, VOLUMES, residue_ball
-from igps.learning.fitting import split_head
 from igps.nn.axes import InteriorDistance
 from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
@@ -63,9 +62,9 @@ def signature(seed, bend):
     return signature_of(trace(seed, bend))
 
 
-def described(*signatures, size=True):
+def described(*signatures):
     with torch.no_grad():
-        return molecular(size=size).eval()(collate(signatures))
+        return molecular().eval()(collate(signatures))
 
 
 def test_pairs_are_counted_by_the_shares_of_both_samples():
@@ -88,48 +87,16 @@ def test_pairs_are_counted_by_the_shares_of_both_samples():
 
 def test_a_bent_molecule_is_nearest_to_itself():
     signatures = [signature(seed, bend) for seed in range(4) for bend in (0.0, 2.0)]
-    for size in (True, False):
-        found = described(*signatures, size=size)
-        distances = molecular(size=size).distances(found, found).fill_diagonal_(np.inf)
-        expected = [1, 0, 3, 2, 5, 4, 7, 6]
-        assert distances.argmin(dim=1).tolist() == expected
+    found = described(*signatures)
+    distances = chi_square(found, found).fill_diagonal_(np.inf)
+    assert distances.argmin(dim=1).tolist() == [1, 0, 3, 2, 5, 4, 7, 6]
 
 
 def test_motion_changes_little():
-    here = described(signature(0, 0.0), size=False)
-    there = described(signature_of(moved(trace(0, 0.0))), size=False)
-    other = described(signature(1, 0.0), size=False)
-    distances = molecular(size=False).distances
-    assert distances(here, there) < 0.2 * distances(here, other)
-
-
-def test_size_is_a_factor_of_the_distance():
-    one = signature(0, 0.0)
-    other = signature(1, 2.0)
-    larger = replace(other, area=1.5 * one.area, volume=one.volume / 2)
-    found = described(one, larger)
-    without = described(one, larger, size=False)
-    np.testing.assert_allclose(found[:, :-2], without)
-    s = np.log(1.5) + np.log(2)
-    d = chi_square(without[:1], without[1:])
-    wanted = d + (d + molecular().scale / 4) * s / 0.5
-    np.testing.assert_allclose(molecular().distances(found[:1], found[1:]), wanted, rtol=1e-4)
-    assert float(molecular().distances(found[:1], found[:1])) == 0
-    # Of one size, molecules differ by their form
-    same_size = described(one, replace(other, area=one.area, volume=one.volume))
-    np.testing.assert_allclose(molecular().distances(*same_size.split(1)), d, rtol=1e-4)
-
-
-def test_statistics_compare_the_histograms_and_not_the_size():
-    """By Hellinger's distance; size alone would be all that counts, as its logarithms are no shares."""
-    one = signature(0, 0.0)
-    other = signature(1, 2.0)
-    found = described(one, replace(one, area=2 * one.area), other)
-    rows = molecular().coordinates(found)
-    cells = described(one, other, size=False)
-    wanted = (cells[0].sqrt() - cells[1].sqrt()).square().sum()
-    np.testing.assert_allclose((rows[0] - rows[2]).square().sum(), wanted, rtol=1e-4)
-    assert float((rows[0] - rows[1]).norm()) < 1e-5
+    here = described(signature(0, 0.0))
+    there = described(signature_of(moved(trace(0, 0.0))))
+    other = described(signature(1, 0.0))
+    assert chi_square(here, there) < 0.2 * chi_square(here, other)
 
 
 def test_it_has_a_name_but_is_not_for_any_body():
@@ -150,19 +117,13 @@ def test_shares_of_another_kind_are_named():
         Shares("residue_shares", 2).memberships(torch.tensor([[float("nan"), 1.0]]))
 
 
-def test_a_head_is_fitted_to_the_histograms_and_an_explanation_holds_the_size():
-    """The logarithms of area and volume are no cells."""
+def test_an_explanation_names_four_parts_and_their_samples():
     found = described(signature(0, 0), signature(1, 0))
-    assert found.shape[1] == molecular().n_features
-    histograms, _ = split_head("molecular")
-    batch = collate([signature(0, 0), signature(1, 0)])
-    torch.testing.assert_close(histograms(batch), found[:, :-2])
-    assert histograms.n_features == found.shape[1] - 2
     told = explain(molecular(), collate([signature(0, 0)]), collate([signature(1, 0)]))
     distance = float(molecular().distances(found[:1], found[1:]))
     assert told.distance == pytest.approx(distance, rel=1e-3)
     expected = pytest.approx(told.distance, rel=1e-6)
     assert sum(told.parts.values()) == expected
-    assert list(told.parts) == ["form", "fold", "composition", "charges", "size"]
+    assert list(told.parts) == ["form", "fold", "composition", "charges"]
     shares = [one.sum() for of_body in told.samples for one in of_body.values()]
     assert sum(shares) == pytest.approx(told.distance)
