@@ -225,16 +225,13 @@ class HatClusters:
 
     def far_clusters(self, x: Floats, ratio: float) -> tuple[Integers, Integers]:
         """Return the clusters that are `ratio` or more radii from the box of points x (3, n), and the other hats."""
-        return find_far_clusters(
-            x.min(axis=1),
-            x.max(axis=1),
-            self.centres,
-            self.radii,
-            self.level_starts,
-            ratio,
-            _LEAF_SIZE,
-            self.n_hats,
-        )
+        box = x.min(axis=1), x.max(axis=1)
+        balls = self.centres, self.radii, self.level_starts
+        stack = np.empty((len(self.radii), 2), np.int64)
+        clusters = np.empty(len(self.radii), np.int64)
+        hats = np.empty(self.n_hats, np.int64)
+        n_clusters, n_hats = find_far_clusters(box, balls, ratio, _LEAF_SIZE, stack, clusters, hats)
+        return clusters[:n_clusters], hats[:n_hats]
 
 
 def _fill_cluster_terms(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
 from igps._arrays import Booleans, Floats, Integers
-from igps._compiled import ALLOCATES, FUSE, compiled
+from igps._compiled import FUSE, compiled
 
 SurfaceArrays = tuple[Integers, Floats, Integers, Integers]
 """Faces, table, face_starts and incident_faces of a `HatSurface`."""
@@ -29,23 +29,25 @@ _ARCTAN = tuple(
 )
 
 
-@compiled(**ALLOCATES)
+@compiled()
 def find_far_clusters(
-    low: Floats,
-    high: Floats,
-    centres: Floats,
-    radii: Floats,
-    starts: Integers,
+    box: tuple[Floats, Floats],
+    balls: tuple[Floats, Floats, Integers],
     ratio: float,
     leaf: int,
-    n_hats: int,
-) -> tuple[Integers, Integers]:
-    """Return the clusters that are `ratio` or more radii from a box, and the hats in none of these, ascending."""
-    clusters = np.empty(len(radii), np.int64)
-    hats = np.empty(n_hats, np.int64)
+    stack: Integers,
+    clusters: Integers,
+    hats: Integers,
+) -> tuple[int, int]:
+    """Write the clusters (C,) that are `ratio` or more radii from a box, and the hats (V,) in none of these, ascending.
+
+    Return their numbers. The balls are the centres, radii and level starts of `HatClusters`; the stack (C, 2) is scratch
+    space.
+    """
+    low, high = box
+    centres, radii, starts = balls
     n_clusters, n_near, n_stacked = 0, 0, 0
     n_levels = len(starts) - 1
-    stack = np.empty((starts[n_levels] - starts[n_levels - 1] + 4 * n_levels, 2), np.int64)
     for cluster in range(starts[n_levels] - 1, starts[n_levels - 1] - 1, -1):
         stack[n_stacked, 0] = cluster
         stack[n_stacked, 1] = n_levels - 1
@@ -69,10 +71,10 @@ def find_far_clusters(
                 stack[n_stacked, 1] = level - 1
                 n_stacked += 1
         else:
-            for hat in range(leaf * number, min(leaf * number + leaf, n_hats)):
+            for hat in range(leaf * number, min(leaf * number + leaf, len(hats))):
                 hats[n_near] = hat
                 n_near += 1
-    return clusters[:n_clusters], hats[:n_near]
+    return n_clusters, n_near
 
 
 @compiled(fastmath=FUSE)
@@ -220,7 +222,9 @@ def add_near_faces(
     face_starts = surface[2]
     incident_faces = surface[3]
     n_hats = len(hats)
-    n_pairs = 0
+    n_pairs = np.int64(
+        0
+    )  # a plain 0 has another type, for which Numba would compile `add_faces` again
     for k in range(n_hats):
         hat = hats[k]
         if hat < 0:
@@ -239,7 +243,7 @@ def add_near_faces(
                     n_pairs += 1
             if n_pairs >= _N_PAIRS:
                 add_faces(x, n_pairs, surface, row_of, near, weights, touched, pairs)
-                n_pairs = 0
+                n_pairs = np.int64(0)
     add_faces(x, n_pairs, surface, row_of, near, weights, touched, pairs)
 
 
