@@ -41,8 +41,8 @@ def find_far_clusters(
 ) -> tuple[int, int]:
     """Write the clusters (C,) that are `ratio` or more radii from a box, and the hats (V,) in none of these, ascending.
 
-    Return their numbers. The balls are the centres, radii and level starts of `HatClusters`; the stack (C, 2) is scratch
-    space.
+    Return their numbers. The balls are the centres, radii and level starts of `HatClusters`. The stack (C, 2) is
+    scratch space.
     """
     low, high = box
     centres, radii, starts = balls
