@@ -36,7 +36,7 @@ NAMES = {
 }
 SPACINGS = ((1, 1, 1), (1, 1, 3))
 N_PLACES = 3
-RADII = (4, 8, 16)
+RADII = (4, 8)
 
 Numbers = dict[str, float]
 Inside = Callable[[np.ndarray], np.ndarray]
