@@ -256,11 +256,12 @@ def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path):
 
 def test_a_strangers_gallery_runs_nothing(tmp_path):
     """LanceDB would load the model that a table names; a head that does not fit is told in a sentence."""
-    for name, value in (("embedding_functions", b"[]"), ("gallery", b"{"), ("gallery", b"[1]")):
-        table = written(tmp_path / "g.igps", units(3), "cosine")
+    damages = (("embedding_functions", b"[]"), ("gallery", b"{"), ("gallery", b"[1]"))
+    for number, (name, value) in enumerate(damages):
+        table = written(tmp_path / f"{number}.igps", units(3), "cosine")
         head = {**table.table.to_arrow().schema.metadata, name.encode(): value}
         with_head(table, head)
-        with pytest.raises(ValueError, match=r"g\.igps: the gallery is damaged\. Restore"):
+        with pytest.raises(ValueError, match=r"\d\.igps: the gallery is damaged\. Restore"):
             BodyTable(table.path)
     table = written(tmp_path / "map.igps", units(3), "cosine")
     lancedb.connect(table.path).create_table("map-x", pa.table({"arrays": [b"\x80\x04N."]}))
