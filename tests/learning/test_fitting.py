@@ -190,12 +190,8 @@ def test_balanced_accuracy_and_area_count_small_classes_as_much_as_large_ones():
 
 def test_what_tells_the_classes_without_form_is_said(dataset):
     assert shortcuts(dataset) == []
-    columns = {
-        "scanner": [
-            "A" if label in ("flat", "round") else label for label in dataset.bodies.labels
-        ],
-        "age": [str(i) for i in range(16)],
-    }
+    scanners = ["A" if label in ("flat", "round") else label for label in dataset.bodies.labels]
+    columns = {"scanner": tuple(scanners), "age": tuple(map(str, range(16)))}
     told = copy.copy(dataset)
     told.bodies = replace(dataset.bodies, columns=columns)
     assert shortcuts(told) == []  # two of four classes have one scanner
