@@ -1,7 +1,5 @@
 """The example of the page *Add a command*, as another package would install it."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib
@@ -16,7 +14,7 @@ from own_descriptors import write_egg
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "add-command.md"
 
 
-def file_of_the_page(name: str) -> str:
+def file_of_the_page(name):
     """The text of the block whose title is this file."""
     pattern = rf'^```\w+ title="{re.escape(name)}"\n(.*?)^```'
     match = re.search(pattern, PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
@@ -25,7 +23,7 @@ def file_of_the_page(name: str) -> str:
 
 
 @pytest.fixture
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def installed(tmp_path, monkeypatch):
     """The package of the page, laid out on the Python path as pip would do it."""
     project = tomllib.loads(file_of_the_page("pyproject.toml"))["project"]
     folder = tmp_path / "site"

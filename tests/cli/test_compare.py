@@ -1,11 +1,8 @@
 """`igps compare`: its files and its table are what Python computes."""
 
-from __future__ import annotations
-
 import csv
 import json
 import logging
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +23,7 @@ CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surfac
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     """Three balls and three long eggs; the last ball is an egg by its height."""
     folder = tmp_path_factory.mktemp("collection")
     for label, heights in (("ball", (1.0, 1.1, 2.3)), ("egg", (2.2, 2.4, 2.6))):

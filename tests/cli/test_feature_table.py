@@ -1,9 +1,5 @@
 """`igps extract` writes a row for each body, or for each file, that pandas reads back."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,7 +13,7 @@ INTERIOR = "own_descriptors:small_interior"
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     """Two subjects with a liver and a spleen of voxels of 2 mm; the second has seven voxels of a heart as well."""
     folder = tmp_path_factory.mktemp("subjects")
     index = np.indices((24, 20, 20))
@@ -34,7 +30,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def extract(monkeypatch: pytest.MonkeyPatch, root: Path, out: Path, *options: str) -> None:
+def extract(monkeypatch, root, out, *options):
     cache = ["--cache_dir", str(root.parent / "cache"), "--n_workers", "1"]
     words = ["extract", root, "--out", out, "--descriptor", INTERIOR]
     run(monkeypatch, *words, *SMALL, *cache, *options)

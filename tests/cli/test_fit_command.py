@@ -1,12 +1,8 @@
 """`igps fit` makes a file that every command takes, and `igps classify` asks it."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +27,7 @@ HEIGHTS = {"flat": 0.5, "long": 2.0}
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     """Two classes of three eggs, and a model that was fitted to them by the command."""
     folder = tmp_path_factory.mktemp("fit_command")
     for label, height in HEIGHTS.items():
@@ -40,12 +36,12 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def call(monkeypatch: pytest.MonkeyPatch, root: Path, *words: object) -> None:
+def call(monkeypatch, root, *words):
     run(monkeypatch, *words, "--cache_dir", root / "cache", "--n_workers", 1, *SMALL)
 
 
 @pytest.fixture
-def model(root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def model(root, monkeypatch):
     path = root / "out" / "mine.safetensors"
     if not path.exists():
         options = ["--descriptor", "rich", "--head", "classifier", "--out", path]
@@ -53,7 +49,7 @@ def model(root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def dataset(root: Path, model: Path) -> library.SignatureDataset:
+def dataset(root, model):
     config = library.SignatureConfig(resolution=9, min_samples=0, n_surface_samples=40)
     return library.SignatureDataset(
         root / "eggs", config, root / "cache", descriptor=library.descriptor(model)
@@ -186,7 +182,7 @@ def test_every_command_takes_the_file(root, model, tmp_path, monkeypatch, capsys
 def test_classify_tells_what_python_computes(root, model, tmp_path, monkeypatch, capsys):
     out = tmp_path / "classes.csv"
     call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--out", out, "--json")
-    told: list[dict[str, Any]] = json.loads(capsys.readouterr().out)
+    told = json.loads(capsys.readouterr().out)
     expected = classify(dataset(root, model), str(model))
     assert [one["name"] for one in told] == list(expected.names)
     assert [one["most_like"] for one in told] == ["flat"] * 3 + ["long"] * 3

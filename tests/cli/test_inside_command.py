@@ -1,11 +1,8 @@
 """`igps inside`: the table of images around generated labels, and what is said of images that cannot be used."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,19 +21,19 @@ AFFINE = np.diag([1.0, 1.0, 2.0, 1.0])
 SHAPE = (20, 22, 14)
 
 
-def write(path: Path, values: np.ndarray) -> None:
+def write(path, values):
     path.parent.mkdir(parents=True, exist_ok=True)
     nibabel.save(nibabel.Nifti1Image(values, AFFINE), path)
 
 
-def radius(scale: float) -> np.ndarray:
+def radius(scale):
     """The distance of each voxel from the centre of an ellipsoid, 1 on its surface."""
     x, y, z = (np.indices(SHAPE).T - (np.array(SHAPE) - 1) / 2).T
     return np.sqrt((x / 6 / scale) ** 2 + (y / 8) ** 2 + (2 * z / 9) ** 2)
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     """Four ellipsoids, bright at the rim, bright in the core, constant, and one without an image of its own."""
     folder = tmp_path_factory.mktemp("inside") / "labels"
     images = (100 + 50 * radius(1.0), 100 - 50 * radius(1.1), np.full(SHAPE, 7.0))
@@ -49,7 +46,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def igps(monkeypatch: pytest.MonkeyPatch, root: Path, *words: object) -> None:
+def igps(monkeypatch, root, *words):
     cache = ["--cache_dir", root.parent / "cache"]
     run(monkeypatch, *words, *cache, *SMALL)
 

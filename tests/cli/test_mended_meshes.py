@@ -1,10 +1,7 @@
 """What commands say and write of the meshes that they mended, and of those of which nothing could be made."""
 
-from __future__ import annotations
-
 import csv
 import logging
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +24,7 @@ ONE = ["--descriptor", "own_descriptors:small_interior", *SMALL]
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     """Three balls, two of them damaged, and three eggs, one of them damaged; and two boxes."""
     folder = tmp_path / "meshes"
     for label, height in (("ball", 1.0), ("egg", 2.0)):
@@ -44,11 +41,11 @@ WELDED = f"welded {3 * N_FACES - N_VERTICES} coincident vertices"
 SUMMARY = "5 of 8 bodies repaired: 2 welded, 2 subdivided, 1 filled"
 
 
-def notes(path: Path) -> list[tuple[str, str]]:
+def notes(path):
     return [(row["name"], row["note"]) for row in csv.DictReader(path.open(newline=""))]
 
 
-def check_notes(path: Path) -> None:
+def check_notes(path):
     """Each mended file, by what was done to it by hand, and no other."""
     found = dict(notes(path))
     assert len(found) == len(notes(path))
@@ -174,7 +171,7 @@ def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
         for i in range(2):
             write_clean(root / label / f"{i}.off", 1 + 0.1 * i, height)
 
-    def features(place: Path) -> tuple[list[str], np.ndarray]:
+    def features(place):
         target = place if command == "retrieve" else place / "all.npz"
         run(monkeypatch, command, root, "--out", target, "--cache_dir", place / "cache", *ONE)
         with np.load(place / ("distances.npz" if command == "retrieve" else "all.npz")) as archive:

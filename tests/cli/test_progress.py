@@ -1,9 +1,6 @@
 """What takes long shows a bar on standard error, with the time left, and leaves standard output to the results."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +13,7 @@ BAR = re.compile(r"^([\w -]+): (\d+)/(\d+) \[\d\d:\d\d<(?:\d\d:\d\d|\?)\]$", re.
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     """Two balls and two long eggs."""
     for label, heights in (("ball", (1.0, 1.1)), ("egg", (2.2, 2.4))):
         for i, height in enumerate(heights):
@@ -24,9 +21,9 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "meshes"
 
 
-def bars(text: str) -> dict[str, tuple[int, int]]:
+def bars(text):
     """Of the longest bar of each name, where it stood last and where it ends."""
-    found: dict[str, tuple[int, int]] = {}
+    found = {}
     for name, done, total in BAR.findall(text):
         if int(total) >= found.get(name.strip(), (0, 0))[1]:
             found[name.strip()] = (int(done), int(total))
