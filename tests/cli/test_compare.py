@@ -44,9 +44,8 @@ def test_command_prints_and_writes_what_python_computes(root, tmp_path, monkeypa
     rows = json.loads((out / "compare.json").read_text())
     assert [list(row) for row in rows] == [KEYS] * 3
     assert [row["descriptor"] for row in rows] == ["shape_dna", "d2", "interior"]
-    for row, result in zip(
-        rows, compare(dataset, chosen, n_workers=1, progress=False), strict=True
-    ):
+    results = compare(dataset, chosen, n_workers=1, progress=False)
+    for row, result in zip(rows, results, strict=True):
         name = result.descriptor.name
         expected = result.row()
         assert row.pop("seconds_per_mesh") >= 0
@@ -66,22 +65,9 @@ def test_command_prints_and_writes_what_python_computes(root, tmp_path, monkeypa
 
 def test_the_papers_the_learned_and_the_compared_run_side_by_side(tmp_path, monkeypatch, capsys):
     ArticulatedShapes(n_classes=2, n_per_class=2, seed=5, n_vertices=500).write(tmp_path / "meshes")
-    options = [
-        "--signature.resolution",
-        "12",
-        "--signature.n_surface_samples",
-        "100",
-        "--n_workers",
-        "1",
-    ]
-    options += [
-        "--signature.min_samples",
-        "100",
-        "--cache_dir",
-        tmp_path / "cache",
-        "--out",
-        tmp_path / "out",
-    ]
+    options = ["--signature.resolution", 12, "--signature.n_surface_samples", 100]
+    options += ["--signature.min_samples", 100, "--n_workers", 1]
+    options += ["--cache_dir", tmp_path / "cache", "--out", tmp_path / "out"]
     names = ["interior", "rich", "pretrained", "d2"]
     run(monkeypatch, "compare", tmp_path / "meshes", "--descriptors", *names, *options)
     printed = capsys.readouterr().out
@@ -107,16 +93,8 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
     logging.disable(logging.WARNING)
     bad = root / "egg" / "bad.off"
     bad.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    arguments = [
-        "compare",
-        root,
-        "--out",
-        tmp_path,
-        "--cache_dir",
-        root.parent / "cache",
-        *SMALL,
-        "--descriptors",
-    ]
+    arguments = ["compare", root, "--out", tmp_path, "--cache_dir", root.parent / "cache"]
+    arguments += [*SMALL, "--descriptors"]
     chosen = ["own_descriptors:picky", "own_descriptors:broken"]
     try:
         run(monkeypatch, *arguments, *chosen)
@@ -147,17 +125,9 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
 def test_unknown_descriptor_is_named_before_anything_is_computed(
     root, tmp_path, monkeypatch, capsys
 ):
+    words = ["compare", root, "--descriptors", "d2", "d5", "--cache_dir", tmp_path / "cache"]
     with pytest.raises(SystemExit, match="1"):
-        run(
-            monkeypatch,
-            "compare",
-            root,
-            "--descriptors",
-            "d2",
-            "d5",
-            "--cache_dir",
-            tmp_path / "cache",
-        )
+        run(monkeypatch, *words)
     error = capsys.readouterr().err
     known = ", ".join([*NAMES, *FIELD_NAMES])
     assert f"expected one of {known}, or package.module:NAME" in error

@@ -44,18 +44,14 @@ def test_table_and_file_of_a_folder_that_can_be_used(tmp_path, monkeypatch, caps
     rows = {row["name"]: row for row in csv.DictReader(out.open(newline=""))}
     assert list(rows) == ["a/clean.off", "a/soup.off", "b/box.off"]
     for name, row in rows.items():
-        assert [row["vertices"], row["vertices_after"], row["seconds"], row["megabytes"]] == cells[
-            name
-        ][:4]
+        numbers = [row["vertices"], row["vertices_after"], row["seconds"], row["megabytes"]]
+        assert numbers == cells[name][:4]
         assert row["usable"] == "yes"
         assert row["error"] == ""
         assert float(row["seconds"]) > 0
         assert float(row["megabytes"]) > 0
-    assert (
-        rows["a/clean.off"]["fault"],
-        rows["a/clean.off"]["mended_by"],
-        rows["a/clean.off"]["notes"],
-    ) == ("",) * 3
+    for column in ("fault", "mended_by", "notes"):
+        assert rows["a/clean.off"][column] == ""
     assert "boundary edges" in rows["a/soup.off"]["fault"]
     assert rows["a/soup.off"]["mended_by"] == "welded"
     assert rows["a/soup.off"]["notes"] == f"welded {3 * N_FACES - N_VERTICES} coincident vertices"
@@ -75,16 +71,13 @@ def test_status_is_1_if_a_file_cannot_be_used(tmp_path, monkeypatch, capsys):
     for name, sentence in sentences.items():
         (line,) = [line for line in lines if line.startswith(f"{name} ")]
         assert line.endswith(f"cannot be used: {root / name}: {sentence}")
-    assert any(
-        line.startswith(f"{1 + len(sentences)} bodies: 0 repaired, {len(sentences)} cannot be used")
-        for line in lines
-    )
+    total = f"{1 + len(sentences)} bodies: 0 repaired, {len(sentences)} cannot be used"
+    assert any(line.startswith(total) for line in lines)
     assert "Traceback" not in printed.out + printed.err
     rows = {row["name"]: row for row in csv.DictReader(out.open(newline=""))}
-    assert {name: row["usable"] for name, row in rows.items()} == {
-        "clean.off": "yes",
-        **dict.fromkeys(sentences, "no"),
-    }
+    usable = [name for name, row in rows.items() if row["usable"] == "yes"]
+    assert usable == ["clean.off"]
+    assert set(rows) == {"clean.off", *sentences}
     for name, sentence in sentences.items():
         assert rows[name]["error"] == f"{root / name}: {sentence}"
 
@@ -108,6 +101,5 @@ def test_files_that_bodies_bring_along_are_not_examined(tmp_path, monkeypatch, c
     write_clean(tmp_path / "a" / "clean.off")
     write_clean(tmp_path / "a" / "clean_fields.off")
     run(monkeypatch, "doctor", tmp_path, "--attribute", "f=a/{stem}_fields.off", *FEW)
-    assert (
-        capsys.readouterr().out.splitlines()[-1].startswith("1 body: 0 repaired, 0 cannot be used")
-    )
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("1 body: 0 repaired, 0 cannot be used")

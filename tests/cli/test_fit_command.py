@@ -6,7 +6,6 @@ import shutil
 
 import numpy as np
 import pytest
-import torch
 from scipy.stats import binomtest
 
 import igps as library
@@ -15,14 +14,8 @@ from igps.learning.fitting import classify
 from igps.nn.description import describe
 from own_descriptors import write_egg
 
-SMALL = [
-    "--signature.resolution",
-    "9",
-    "--signature.min_samples",
-    "0",
-    "--signature.n_surface_samples",
-    "40",
-]
+SMALL = ["--signature.resolution", 9, "--signature.min_samples", 0]
+SMALL += ["--signature.n_surface_samples", 40]
 HEIGHTS = {"flat": 0.5, "long": 2.0}
 
 
@@ -51,9 +44,8 @@ def model(root, monkeypatch):
 
 def dataset(root, model):
     config = library.SignatureConfig(resolution=9, min_samples=0, n_surface_samples=40)
-    return library.SignatureDataset(
-        root / "eggs", config, root / "cache", descriptor=library.descriptor(model)
-    )
+    chosen = library.descriptor(model)
+    return library.SignatureDataset(root / "eggs", config, root / "cache", descriptor=chosen)
 
 
 def test_fit_writes_model_and_card(root, tmp_path, monkeypatch, capsys):
@@ -75,27 +67,15 @@ def test_fit_writes_model_and_card(root, tmp_path, monkeypatch, capsys):
 
 
 def test_fit_writes_a_folder_to_share(root, tmp_path, monkeypatch, capsys):
-    words = [
-        "fit",
-        root / "eggs",
-        "--descriptor",
-        "rich",
-        "--head",
-        "classifier",
-        "--out",
-        tmp_path / "mine",
-    ]
-    call(monkeypatch, root, *words, "--json")
+    words = ["fit", root / "eggs", "--descriptor", "rich", "--head", "classifier"]
+    call(monkeypatch, root, *words, "--out", tmp_path / "mine", "--json")
     told = json.loads(capsys.readouterr().out)
-    assert {path.name for path in (tmp_path / "mine").iterdir()} == {
-        "model.safetensors",
-        "README.md",
-    }
+    files = {path.name for path in (tmp_path / "mine").iterdir()}
+    assert files == {"model.safetensors", "README.md"}
     assert json.dumps(told["held_out_scores"]) in (tmp_path / "mine" / "README.md").read_text()
     call(monkeypatch, root, "classify", root / "eggs", "--model", tmp_path / "mine", "--json")
-    assert [row["class"] for row in json.loads(capsys.readouterr().out)] == ["flat"] * 3 + [
-        "long"
-    ] * 3
+    classes = [row["class"] for row in json.loads(capsys.readouterr().out)]
+    assert classes == ["flat"] * 3 + ["long"] * 3
 
 
 @pytest.mark.parametrize("cavities", ["fill", "keep"])
@@ -103,51 +83,24 @@ def test_bodies_that_are_read_otherwise_than_those_of_the_fit_are_told(
     root, model, monkeypatch, capsys, cavities
 ):
     call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--cavities", cavities)
-    assert ("read with --cavities fill, not keep" in capsys.readouterr().out) == (
-        cavities == "keep"
-    )
+    is_told = "read with --cavities fill, not keep" in capsys.readouterr().out
+    assert is_told == (cavities == "keep")
 
 
 def test_every_command_takes_the_file(root, model, tmp_path, monkeypatch, capsys):
     found = library.load(model)
     expected = describe(dataset(root, model), found)
-    call(
-        monkeypatch,
-        root,
-        "extract",
-        root / "eggs",
-        "--descriptor",
-        model,
-        "--out",
-        tmp_path / "features.npz",
-    )
+    eggs = root / "eggs"
+    by_model = ["--descriptor", model]
+    call(monkeypatch, root, "extract", eggs, *by_model, "--out", tmp_path / "features.npz")
     with np.load(tmp_path / "features.npz") as archive:
         np.testing.assert_allclose(archive["features"], expected, atol=1e-6)
-    call(
-        monkeypatch,
-        root,
-        "retrieve",
-        root / "eggs",
-        "--descriptor",
-        model,
-        "--out",
-        tmp_path / "retrieved",
-    )
+    call(monkeypatch, root, "retrieve", eggs, *by_model, "--out", tmp_path / "retrieved")
     with np.load(tmp_path / "retrieved" / "distances.npz") as archive:
-        np.testing.assert_allclose(
-            archive["distances"], found.distances(expected, expected), atol=1e-6
-        )
-    call(
-        monkeypatch,
-        root,
-        "compare",
-        root / "eggs",
-        "--descriptors",
-        model,
-        "interior",
-        "--out",
-        tmp_path / "compared",
-    )
+        distances = found.distances(expected, expected)
+        np.testing.assert_allclose(archive["distances"], distances, atol=1e-6)
+    compared = ["compare", eggs, "--descriptors", model, "interior"]
+    call(monkeypatch, root, *compared, "--out", tmp_path / "compared")
     rows = json.loads((tmp_path / "compared" / "compare.json").read_text())
     assert [row["descriptor"] for row in rows] == ["rich_classifier", "interior"]
     call(monkeypatch, root, "precompute", root / "eggs", "--descriptors", model)
@@ -157,17 +110,7 @@ def test_every_command_takes_the_file(root, model, tmp_path, monkeypatch, capsys
     call(monkeypatch, root, *query, "--gallery", root / "eggs", "--descriptor", model)
     nearest = json.loads(capsys.readouterr().out)
     assert [row["class"] for row in nearest] == ["long"] * 3
-    call(
-        monkeypatch,
-        root,
-        "gallery",
-        "build",
-        root / "eggs",
-        "--descriptor",
-        model,
-        "--out",
-        tmp_path / "eggs.igps",
-    )
+    call(monkeypatch, root, "gallery", "build", eggs, *by_model, "--out", tmp_path / "eggs.igps")
     monkeypatch.chdir(tmp_path)
     moved = tmp_path / "moved.safetensors"
     moved.write_bytes(model.read_bytes())
@@ -186,21 +129,15 @@ def test_classify_tells_what_python_computes(root, model, tmp_path, monkeypatch,
     expected = classify(dataset(root, model), str(model))
     assert [one["name"] for one in told] == list(expected.names)
     assert [one["most_like"] for one in told] == ["flat"] * 3 + ["long"] * 3
-    assert [one["probability"] for one in told] == pytest.approx(
-        expected.probabilities.max(dim=1).values.tolist()
-    )
+    largest = expected.probabilities.max(dim=1).values.tolist()
+    assert [one["probability"] for one in told] == pytest.approx(largest)
     with out.open(newline="") as file:
         header, *rows = csv.reader(file)
     assert header == ["name", "class", "most_like", "flat", "long"]
-    assert [row[:3] for row in rows] == [
-        [one["name"], one["class"] or "", one["most_like"]] for one in told
-    ]
-    torch.testing.assert_close(
-        torch.tensor([[float(one) for one in row[3:]] for row in rows]),
-        expected.probabilities,
-        rtol=0,
-        atol=1e-6,
-    )
+    for row, one in zip(rows, told, strict=True):
+        assert row[:3] == [one["name"], one["class"] or "", one["most_like"]]
+    written = np.array([row[3:] for row in rows], dtype=float)
+    np.testing.assert_allclose(written, expected.probabilities, atol=1e-6)
 
 
 def test_what_is_unlike_everything_is_said(root, model, tmp_path, monkeypatch, capsys):
@@ -208,15 +145,8 @@ def test_what_is_unlike_everything_is_said(root, model, tmp_path, monkeypatch, c
 
     box = trimesh.creation.box((1, 1, 12)).subdivide().subdivide().subdivide().subdivide()
     box.export(tmp_path / "rod.off")
-    call(
-        monkeypatch,
-        root,
-        "classify",
-        tmp_path / "rod.off",
-        root / "eggs" / "flat" / "1.off",
-        "--model",
-        model,
-    )
+    files = [tmp_path / "rod.off", root / "eggs" / "flat" / "1.off"]
+    call(monkeypatch, root, "classify", *files, "--model", model)
     lines = capsys.readouterr().out.splitlines()
     rod = next(line for line in lines if "rod.off" in line)
     assert "unlike every known class" in rod
@@ -226,23 +156,18 @@ def test_what_is_unlike_everything_is_said(root, model, tmp_path, monkeypatch, c
 
 def test_wrong_files_cost_one_sentence(root, model, tmp_path, monkeypatch, capsys):
     (tmp_path / "bad.safetensors").write_bytes(model.read_bytes()[:-10])
+    eggs = root / "eggs"
+    damaged = tmp_path / "bad.safetensors"
+    in_format = "expected a descriptor in the format"
+    absent = ["retrieve", eggs, "--descriptor", tmp_path / "no.safetensors"]
     for words, message in (
         (
-            ["fit", root / "eggs", "--out", tmp_path / "mine.pt"],
+            ["fit", eggs, "--out", tmp_path / "mine.pt"],
             "out: expected a file ending in .safetensors",
         ),
-        (
-            ["classify", root / "eggs", "--model", tmp_path / "bad.safetensors"],
-            "expected a descriptor in the format",
-        ),
-        (
-            ["retrieve", root / "eggs", "--descriptor", tmp_path / "bad.safetensors"],
-            "expected a descriptor in the",
-        ),
-        (
-            ["retrieve", root / "eggs", "--descriptor", tmp_path / "no.safetensors"],
-            "no such file. Check the path.",
-        ),
+        (["classify", eggs, "--model", damaged], in_format),
+        (["retrieve", eggs, "--descriptor", damaged], in_format),
+        (absent, "no such file. Check the path."),
     ):
         with pytest.raises(SystemExit, match="1"):
             call(monkeypatch, root, *words)
@@ -267,11 +192,7 @@ def test_what_no_file_can_hold_is_refused_before_anything_is_computed(
 def test_too_few_classes_are_told_before_anything_is_computed(
     goal, root, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(
-        library.SignatureDataset,
-        "precompute",
-        lambda *_, **__: pytest.fail("signatures are computed"),
-    )
+    monkeypatch.setattr(library.SignatureDataset, "precompute", None)  # nothing is computed
     folder = tmp_path / "few"
     n_classes = 2 if goal == "new" else 1
     classes = [path for path in sorted((root / "eggs").iterdir()) if path.is_dir()]
