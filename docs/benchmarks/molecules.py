@@ -49,7 +49,7 @@ def molecules(
     Args:
         structures: folder of structures with classes, such as conformations by protein; each file holds one chain.
         n_seeds: number of times that the families are made.
-        tm_align: also compare by TM-align, for which tmtools must be installed: 0.15 s a pair.
+        tm_align: also compare by TM-align, for which tmtools must be installed: 0.2 s a pair.
         n_aligned: number of folds whose families are compared by TM-align.
     """
     bodies = find_bodies(structures, labelled=True)

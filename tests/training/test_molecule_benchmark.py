@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from docs.benchmarks import molecular_shares as shares_program
 from docs.benchmarks import molecules as program
 
 from igps.fields.molecules.molecule import Molecule
@@ -83,3 +84,23 @@ def test_deformed_and_permuted_chains_move_as_far_as_told():
     assert turned.places.tolist() == list(range(70))
     steps = np.linalg.norm(np.diff(turned.residue_positions, axis=0), axis=1)
     assert (steps > 6).sum() <= 3  # the ends that were joined
+
+
+def test_relatives_are_backbones_without_some_ends(tmp_path):
+    generator = np.random.default_rng(1)
+    offsets = np.array([[-1.2, 0.5, 0], [0, 0, 0], [0.9, 1.1, 0], [0.3, 2.2, 0.4]])
+    positions = CHAINS[4].residue_positions[:, None] + offsets
+    names = generator.choice(program.AMINO_ACIDS, 70).tolist()
+    shares_program.write_changed(tmp_path, positions, names, generator)
+    found = {path.stem: shares_program.backbone(path) for path in tmp_path.iterdir()}
+    at, kinds = found["whole"]
+    np.testing.assert_allclose(at, positions, atol=1e-3)
+    assert kinds == names
+    for title, same in (("bent", 1.0), ("deformed", 1.0), ("relative", 0.4)):
+        at, kinds = found[title]
+        assert 70 - 2 * program.N_CUT <= len(kinds) < 70
+        shares = [
+            np.mean([one == other for one, other in zip(kinds, names[start:], strict=False)])
+            for start in range(program.N_CUT + 1)
+        ]
+        assert abs(max(shares) - same) < 0.2
