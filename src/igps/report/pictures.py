@@ -37,6 +37,7 @@ _MAX_BYTES = 20e6
 _BYTES_PER_VERTEX = 19 * 4 / 3
 _STEPS = 2**16 - 1  # along each axis of the cube in which vertices are quantised
 _ARRAYS = ("vertices", "faces", "potential")
+_FEW = 100  # pictures that take less time than worker processes take to start
 _N_NEIGHBOURS = 4  # samples whose mean is the potential of a vertex
 
 
@@ -97,6 +98,8 @@ def _made(
     """Return the surfaces of bodies by name, made in parallel; a body that fails is logged and left out."""
     names = list(bodies)
     surfaces: dict[str, PageSurface] = {}
+    if n_workers is None and len(names) <= _FEW:
+        n_workers = 1
     with contextlib.closing(run(make, list(bodies.values()), n_workers=n_workers)) as outcomes:
         for number, outcome in Progress(outcomes, total=len(names), desc="pictures"):
             if isinstance(outcome, Failed):
