@@ -30,8 +30,10 @@ def test_names_that_differ_by_a_side_alone_are_a_pair(left, right, subject, stru
     names = (right, "s1.nii.gz#liver", "s1.nii.gz#leftover", left)
     parts = tuple(name.partition("#")[2] or None for name in names)
     (pair,) = find_pairs(Bodies(tuple(map(Path, names)), names, None, parts))
-    assert (pair.subject, pair.structure) == (subject, structure)
-    assert (pair.left, pair.right) == (3, 0)
+    assert pair.subject == subject
+    assert pair.structure == structure
+    assert pair.left == 3
+    assert pair.right == 0
 
 
 def test_files_that_are_named_by_their_sides_are_pairs_of_their_subjects():
@@ -72,16 +74,20 @@ def test_the_odd_pair_comes_first_and_cut_ones_are_not_judged():
     places[cut] += 9
     found = asymmetries(pairs, Places(), torch.from_numpy(places), volumes, cut.tolist())
     first, second, *others, last = found
-    assert (first.pair.subject, first.pair.structure) == ("s3.nii", "hip")
+    assert first.pair.subject == "s3.nii"
+    assert first.pair.structure == "hip"
     assert first.form_score > 3.5 > first.size_score
     distance = np.linalg.norm(places[first.pair.left] - places[first.pair.right])
     assert first.form == pytest.approx(distance)
-    assert (second.pair.subject, second.pair.structure) == ("s5.nii", "kidney")
+    assert second.pair.subject == "s5.nii"
+    assert second.pair.structure == "kidney"
     assert second.size_score > 3.5 > second.form_score
     left, right = volumes[second.pair.left], volumes[second.pair.right]
-    assert second.size == pytest.approx((left - right) / ((left + right) / 2))
+    expected = pytest.approx((left - right) / ((left + right) / 2))
+    assert second.size == expected
     assert max(one.score for one in others) < 3.5
-    assert (last.pair.subject, last.score) == ("s6.nii", None)
+    assert last.pair.subject == "s6.nii"
+    assert last.score is None
 
 
 def test_the_command_finds_the_subject_whose_kidney_is_flat(tmp_path, monkeypatch, capsys):

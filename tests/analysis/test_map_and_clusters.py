@@ -176,4 +176,5 @@ def test_the_ends_of_an_axis_and_what_it_holds():
     for axis, ends in ((1, {0, 2}), (2, {3, 4})):
         found, share = ends_of_axis(distances, axis)
         assert set(found) == ends
-        assert share == pytest.approx(variances[axis - 1] / variances.sum(), rel=1e-3)
+        expected = pytest.approx(variances[axis - 1] / variances.sum(), rel=1e-3)
+        assert share == expected

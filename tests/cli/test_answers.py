@@ -1,11 +1,8 @@
 """Answers from the command line: their files and what they print are what Python computes."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,7 +27,7 @@ OWN = ["--descriptor", "own_descriptors:small_interior"]
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     """Six short eggs and seven long ones, one of which lies among the short, with scanner and age."""
     folder = tmp_path_factory.mktemp("answers") / "meshes"
     rows = [("file", "label", "scanner", "age")]
@@ -46,19 +43,17 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def igps(monkeypatch: pytest.MonkeyPatch, root: Path, *arguments: object) -> None:
+def igps(monkeypatch, root, *arguments):
     cache = ["--cache_dir", root.parent / "cache"]
     run(monkeypatch, *arguments, *cache, *SMALL)
 
 
-def table(path: Path) -> list[dict[str, str]]:
+def table(path):
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def test_groups_prints_and_writes_the_tests(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_groups_prints_and_writes_the_tests(root, tmp_path, monkeypatch, capsys):
     words = [
         "--strata",
         "scanner",
@@ -82,7 +77,8 @@ def test_groups_prints_and_writes_the_tests(
         n_permutations=199,
     )
     shape, size = json.loads((tmp_path / "groups.json").read_text())
-    assert (shape["body"], size["body"]) == ("all", "all, size")
+    assert shape["body"] == "all"
+    assert size["body"] == "all, size"
     assert shape["permanova_p"] == expected.permanova_p < 0.05
     assert shape["auc"] == pytest.approx(expected.auc)
     assert shape["sizes"] == "long:7 short:6"
@@ -92,9 +88,7 @@ def test_groups_prints_and_writes_the_tests(
     assert (tmp_path / "groups.svg").read_text().startswith("<?xml")
 
 
-def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(tmp_path, monkeypatch):
     """Of eight subjects, the right egg is longer than the left one; only as pairs are they told apart so surely."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     place = np.indices((24, 60, 24)) - 12
@@ -113,16 +107,15 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(
     words = ["--group", "side", "--strata", "subject", "--out", tmp_path / "found"]
     igps(monkeypatch, root, "groups", root, *OWN, *words)
     (found,) = json.loads((tmp_path / "found" / "groups.json").read_text())
-    assert (found["body"], found["sizes"]) == ("all", "left:8 right:8")
+    assert found["body"] == "all"
+    assert found["sizes"] == "left:8 right:8"
     assert (
         found["permanova_p"] <= 3 / 128
     )  # the swap of all pairs does as well, and one or two may be drawn more often
 
 
 @pytest.mark.parametrize("name", ["{group}{i}", "{i}", "case_{i}", "{word}"])
-def test_single_masks_in_a_folder_for_each_group_are_compared(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_single_masks_in_a_folder_for_each_group_are_compared(name, tmp_path, monkeypatch):
     """Masks named by their files count as one body; volumes of the groups do not overlap, so p is nearly minimal."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     place = np.indices((24, 24, 24)) - 12
@@ -138,15 +131,14 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(
     words = ["--test_size", "--out", tmp_path / "found"]
     igps(monkeypatch, tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
     _, size = json.loads((tmp_path / "found" / "groups.json").read_text())
-    assert (size["body"], size["sizes"]) == ("all, size", "controls:5 patients:5")
+    assert size["body"] == "all, size"
+    assert size["sizes"] == "controls:5 patients:5"
     assert (
         size["permanova_p"] <= 6 / 252
     )  # of the 252 ways to draw five of ten, this one and its mirror
 
 
-def test_volumes_are_compared_in_one_unit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_volumes_are_compared_in_one_unit(tmp_path, monkeypatch, capsys):
     """Half of the eggs of each group are in metres."""
     root = tmp_path / "eggs"
     heights = {"low": (1.0, 1.02, 1.04, 1.06, 1.08), "high": (2.0, 2.02, 2.04, 2.06, 2.08)}
@@ -169,9 +161,7 @@ def test_volumes_are_compared_in_one_unit(
             assert found[f"{label}/{i}"] == pytest.approx(found["low/0"] * height, rel=1e-5)
 
 
-def test_a_covariate_may_be_words_but_no_mistyped_number(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_covariate_may_be_words_but_no_mistyped_number(root, tmp_path, monkeypatch, capsys):
     rows = table(root / "labels.csv")
     lines = [
         f"{root / row['file']},{row['label']},{'fmm'[i % 3]},{'5o' if i == 4 else i},{'Paris' if i % 3 else 'Nantes'}"
@@ -199,9 +189,7 @@ def test_a_covariate_may_be_words_but_no_mistyped_number(
     assert "dose: expected numbers, got '5o'" in capsys.readouterr().err
 
 
-def test_covariates_that_are_named_one_by_one_all_count(
-    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_covariates_that_are_named_one_by_one_all_count(root, monkeypatch, capsys):
     found = []
     for words in (
         ["--covariate", "age", "scanner"],
@@ -212,9 +200,7 @@ def test_covariates_that_are_named_one_by_one_all_count(
     assert found[0] == found[1]
 
 
-def test_groups_refuses_three_of_a_group(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_groups_refuses_three_of_a_group(root, tmp_path, monkeypatch, capsys):
     rows = table(root / "labels.csv")
     (tmp_path / "labels.csv").write_text(
         "file,ill\n"
@@ -230,9 +216,7 @@ def test_groups_refuses_three_of_a_group(
     assert not (tmp_path / "out" / "groups.png").exists()
 
 
-def test_outliers_lists_the_short_egg_among_the_long_first(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_outliers_lists_the_short_egg_among_the_long_first(root, tmp_path, monkeypatch, capsys):
     igps(monkeypatch, root, "outliers", root, *OWN, "--top", "2", "--out", tmp_path)
     printed = capsys.readouterr().out
     rows = table(tmp_path / "outliers.csv")
@@ -253,9 +237,7 @@ def test_outliers_lists_the_short_egg_among_the_long_first(
 
 
 @pytest.mark.parametrize("masks", [False, True])
-def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(
-    masks: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(masks, tmp_path, monkeypatch):
     """The labels of a file, or the masks of a folder."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     random = np.random.default_rng(0)
@@ -287,17 +269,12 @@ def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(
     )
     first = table(tmp_path / "outliers.csv")[:3]
     assert [row["name"][:2] for row in first] == ["s4"] * 3
-    assert all(float(row["score"]) > LIMIT for row in first)
+    for row in first:
+        assert float(row["score"]) > LIMIT
 
 
 @pytest.mark.parametrize("is_group", [False, True])
-def test_explain_writes_shares_that_add_up(
-    is_group: bool,
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_explain_writes_shares_that_add_up(is_group, root, tmp_path, monkeypatch, capsys):
     what = ["explain", root] if is_group else ["explain", root / "short0.off", root / "long3.off"]
     igps(monkeypatch, root, *what, *OWN, "--out", tmp_path)
     printed = capsys.readouterr().out
@@ -307,14 +284,13 @@ def test_explain_writes_shares_that_add_up(
         assert "cells differ significantly" in printed
         assert float(part["share"]) > 0
     else:
-        assert sum(shares) == pytest.approx(float(part["share"]), rel=1e-6)
+        expected = pytest.approx(float(part["share"]), rel=1e-6)
+        assert sum(shares) == expected
         assert f"short0.off and {root}/long3.off: {float(part['share']):.4g}" in printed
     assert imread(tmp_path / "explain.png").std() > 0.02
 
 
-def test_explain_paints_the_voxels_in_which_an_attribute_differs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_explain_paints_the_voxels_in_which_an_attribute_differs(tmp_path, monkeypatch, capsys):
     """Two equal bodies, one with a bright spot in noise: it has the share."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     affine = np.diag([1.0, 1.0, 1.5, 1.0])
@@ -337,7 +313,8 @@ def test_explain_paints_the_voxels_in_which_an_attribute_differs(
     told = json.loads(capsys.readouterr().out)
     rows = table(tmp_path / "out" / "explain_ct.csv")
     shares = np.array([float(row["share"]) for row in rows])
-    assert shares.sum() == pytest.approx(told["attributes"]["ct"], rel=1e-6)
+    expected = pytest.approx(told["attributes"]["ct"], rel=1e-6)
+    assert shares.sum() == expected
     found = nibabel.load(tmp_path / "out" / "explain_bright.nii.gz_bright_ct.nii.gz")
     density = found.get_fdata()
     np.testing.assert_allclose(found.affine, affine)
@@ -347,9 +324,7 @@ def test_explain_paints_the_voxels_in_which_an_attribute_differs(
     assert imread(tmp_path / "out" / "explain_ct.png").std() > 0.02
 
 
-def test_explain_and_groups_paint_where_an_organ_differs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_explain_and_groups_paint_where_an_organ_differs(tmp_path, monkeypatch, capsys):
     """Organ 1 has a knob on the patient's left in one group; organ 2 does not differ."""
     nibabel = pytest.importorskip("nibabel")
     random = np.random.default_rng(0)
@@ -385,13 +360,7 @@ def test_explain_and_groups_paint_where_an_organ_differs(
         (0, "none of the difference lies on its surface"),
     ],
 )
-def test_explain_tells_how_much_of_the_surface_differs(
-    largest: int,
-    told: str,
-    root: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_explain_tells_how_much_of_the_surface_differs(largest, told, root, monkeypatch, capsys):
     """One of 162 vertices has the whole share, whose area trimesh gives; or no vertex has a positive share."""
     body = trimesh.load(root / "long3.off", process=False)
     area = body.area_faces[(body.faces == 161).any(axis=1)].sum() / 3
@@ -404,9 +373,7 @@ def test_explain_tells_how_much_of_the_surface_differs(
 
 
 @pytest.mark.parametrize("is_group", [False, True])
-def test_explain_heeds_size_and_side(
-    is_group: bool, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_explain_heeds_size_and_side(is_group, root, monkeypatch, capsys):
     """Bodies that are twice as large as others of their form differ in size; the side of symmetric ones is rounding."""
     folder = root.parent / f"sized{is_group}"
     for label, factor in (("small", 1.0), ("large", 2.0)):
@@ -433,7 +400,8 @@ def test_explain_heeds_size_and_side(
     shares = {row["histogram"]: row["share"] for row in found["shares"]}
     assert list(shares)[-2:] == ["side", "size"]
     assert shares["size"] > 0.5 * found["distance"]
-    assert shares["size"] + shares["side"] == pytest.approx(found["distance"], rel=1e-3)
+    expected = pytest.approx(found["distance"], rel=1e-3)
+    assert shares["size"] + shares["side"] == expected
     if is_group:  # painted is the middle of each, although some of its numbers are negative
         assert {name[-5] for name in found["bodies"]} <= set("2345")
 
@@ -455,7 +423,7 @@ def test_explain_shows_the_ends_of_an_axis_of_the_map(root, tmp_path, monkeypatc
     assert end in {f"long{i}.off" for i in range(6)}
 
 
-def test_half_of_a_share_lies_on_a_part_of_the_area_however_small_its_faces_are() -> None:
+def test_half_of_a_share_lies_on_a_part_of_the_area_however_small_its_faces_are():
     """Nearly even over a cap of a ball, a quarter of its area, and zero elsewhere; faces are even, or crowded there."""
     rings = {
         "even": np.linspace(0, np.pi, 121),
@@ -473,12 +441,7 @@ def test_half_of_a_share_lies_on_a_part_of_the_area_however_small_its_faces_are(
         assert percent == pytest.approx(12.5, abs=0.6)  # of two digits
 
 
-def test_clusters_are_the_two_kinds_of_eggs(
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_clusters_are_the_two_kinds_of_eggs(root, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     out = ["--out", "figures"]
     igps(monkeypatch, root, "clusters", root, *OWN, "--n_clusters", "2", *out)
@@ -493,21 +456,15 @@ def test_clusters_are_the_two_kinds_of_eggs(
     assert "long6.off" in (tmp_path / "figures" / "clusters.json").read_text()
 
 
-def test_a_stability_that_was_not_measured_is_unknown(
-    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stability_that_was_not_measured_is_unknown(root, monkeypatch, capsys):
     igps(monkeypatch, root, "clusters", root, *OWN, "--n_clusters", "2", "--n_resamples", "0")
     assert "0 of 2 clusters are stable (at least 0.75), 2 unknown\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("colour", ["class", "cluster", "volume", "age", "scanner"])
 def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
-    colour: str,
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    colour, root, tmp_path, monkeypatch, capsys
+):
     igps(monkeypatch, root, "map", root, *OWN, "--colour", colour, "--out", tmp_path)
     rows = table(tmp_path / "map.csv")
     dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
@@ -529,9 +486,7 @@ def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
     assert (tmp_path / "map.svg").read_text().startswith("<?xml")
 
 
-def test_a_column_called_as_the_coordinates_leaves_them_alone(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_column_called_as_the_coordinates_leaves_them_alone(root, tmp_path, monkeypatch):
     rows = table(root / "labels.csv")
     (tmp_path / "labels.csv").write_text(
         "file,x\n" + "".join(f"{root / row['file']},7\n" for row in rows)
@@ -542,7 +497,7 @@ def test_a_column_called_as_the_coordinates_leaves_them_alone(
     assert len({row["x"] for row in found}) == len(rows)
 
 
-def test_what_is_not_known_is_null_in_the_file(tmp_path: Path) -> None:
+def test_what_is_not_known_is_null_in_the_file(tmp_path):
     write_analysis(tmp_path, "rows", [{"body": "é", "stability": float("nan")}])
     assert json.loads((tmp_path / "rows.json").read_text(), parse_constant=pytest.fail) == [
         {"body": "é", "stability": None}
@@ -550,7 +505,7 @@ def test_what_is_not_known_is_null_in_the_file(tmp_path: Path) -> None:
     assert table(tmp_path / "rows.csv")[0]["body"] == "é"
 
 
-def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path: Path) -> None:
+def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path):
     names = ["cost_$a_{$.off", "_under", "$x$"]
     distances = np.array([[0.0, 1, 3], [1, 0, 2], [3, 2, 0]])
     figures = {
@@ -561,11 +516,12 @@ def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path: Path) -> None
         write_analysis(tmp_path, name, [{"body": "a"}], figure)
         assert imread(tmp_path / f"{name}.png").std() > 0.02
         drawn = (tmp_path / f"{name}.svg").read_text()
-        assert all(f"<!-- {one}" in drawn for one in names)
+        for one in names:
+            assert f"<!-- {one}" in drawn
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path: Path) -> None:
+def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path):
     distances = np.array([[0.0, 1, 3], [1, 0, 2], [3, 2, 0]])
     for folder in ("one", "other"):
         figure = clusters_figure(
@@ -594,13 +550,8 @@ def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path: P
     ],
 )
 def test_what_labels_do_not_tell_is_refused_before_anything_is_computed(
-    command: list[str],
-    message: str,
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    command, message, root, tmp_path, monkeypatch, capsys
+):
     cache = ["--cache_dir", tmp_path / "cache"]
     where = next(i for i, word in enumerate(command) if word.startswith("--"))
     words = [*command[:where], root, *command[where:], *OWN, *cache, *SMALL]
@@ -610,9 +561,7 @@ def test_what_labels_do_not_tell_is_refused_before_anything_is_computed(
     assert not (tmp_path / "cache").exists()
 
 
-def test_three_classes_are_refused_before_anything_is_computed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_three_classes_are_refused_before_anything_is_computed(tmp_path, monkeypatch, capsys):
     for label in "abc":
         write_egg(tmp_path / "eggs" / label / "0.off", 1.0, subdivisions=2)
     words = ["explain", tmp_path / "eggs", "--cache_dir", tmp_path / "cache"]

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import csv
 import importlib.metadata
 import json
@@ -8,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 from typing import get_type_hints
 
 import numpy as np
@@ -34,7 +31,7 @@ CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surfac
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     """Three balls and three long eggs."""
     for label, ratio in (("ball", 1.0), ("egg", 2.2)):
         for i in range(3):
@@ -46,9 +43,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "meshes"
 
 
-def test_retrieve_prints_and_writes_what_python_computes(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_retrieve_prints_and_writes_what_python_computes(root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     run(
         monkeypatch,
@@ -94,11 +89,13 @@ def test_retrieve_prints_and_writes_what_python_computes(
         6,
         0,
     ]
-    assert {name: scores[name] for name in expected.mean()} == pytest.approx(expected.mean())
+    found = {name: scores[name] for name in expected.mean()}
+    assert found == pytest.approx(expected.mean())
     assert scores["per_class"]["egg"]["ft"] == pytest.approx(expected.per_class()["egg"]["ft"])
     assert scores["config"]["resolution"] == 10
     assert f"{100 * expected.mean()['ft']:.1f}" in printed
-    assert all(word in printed for word in ("NN", "ADR self", "mAP", "ball", "egg", "6 queries"))
+    for word in ("NN", "ADR self", "mAP", "ball", "egg", "6 queries"):
+        assert word in printed
 
     with np.load(out / "distances.npz") as archive:
         np.testing.assert_allclose(archive["distances"], distances, atol=1e-7)
@@ -109,8 +106,10 @@ def test_retrieve_prints_and_writes_what_python_computes(
     for i, name in enumerate(dataset.bodies.names):
         ranked = [row for row in rows if row["query"] == name]
         others = [j for j in torch.argsort(distances[i], stable=True).tolist() if j != i]
-        assert [row["model"] for row in ranked] == [dataset.bodies.names[j] for j in others]
-        assert [row["relevant"] for row in ranked] == [str(int(i // 3 == j // 3)) for j in others]
+        found = [row["model"] for row in ranked]
+        assert found == [dataset.bodies.names[j] for j in others]
+        found = [row["relevant"] for row in ranked]
+        assert found == [str(int(i // 3 == j // 3)) for j in others]
     assert not (out / "failures.csv").exists()
 
 
@@ -122,7 +121,8 @@ def test_some_bodies_ask_the_others(root, tmp_path, monkeypatch, capsys):
     assert "2 queries, each against all that are no queries" in capsys.readouterr().out
     rows = list(csv.DictReader((out / "ranking.csv").open(newline="")))
     assert {row["query"] for row in rows} == {"ball/1.off", "egg/1.off"}
-    assert all(row["model"].endswith(("0.off", "2.off")) for row in rows)
+    for row in rows:
+        assert row["model"].endswith(("0.off", "2.off"))
     assert len(rows) == 2 * 4
     with np.load(out / "distances.npz") as archive:
         distances = archive["distances"][[1, 4]][:, [0, 2, 3, 5]]
@@ -133,10 +133,8 @@ def test_some_bodies_ask_the_others(root, tmp_path, monkeypatch, capsys):
     assert "queries: expected a pattern that some bodies match, 0 of 6 match" in wrong
 
 
-def test_results_are_written_though_nobody_reads_what_is_printed(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def gone(*words: object) -> None:
+def test_results_are_written_though_nobody_reads_what_is_printed(root, tmp_path, monkeypatch):
+    def gone(*words):
         raise BrokenPipeError
 
     monkeypatch.setattr("igps.cli.retrieval.print", gone, raising=False)
@@ -145,9 +143,7 @@ def test_results_are_written_though_nobody_reads_what_is_printed(
     assert (tmp_path / "out" / "scores.json").exists()
 
 
-def test_retrieve_reranks_in_a_table_of_its_own(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_retrieve_reranks_in_a_table_of_its_own(root, tmp_path, monkeypatch, capsys):
     options = ("--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL)
     for name, further in (("plain", ()), ("both", ("--rerank",))):
         run(monkeypatch, "retrieve", root, "--out", tmp_path / name, *options, *further)
@@ -165,9 +161,7 @@ def test_retrieve_reranks_in_a_table_of_its_own(
     assert "reranked" not in plain
 
 
-def test_gps_is_another_descriptor_on_the_same_cache(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gps_is_another_descriptor_on_the_same_cache(root, tmp_path, monkeypatch):
     for name in ("interior", "gps"):
         arguments = [
             "--descriptor",
@@ -195,10 +189,8 @@ def test_gps_is_another_descriptor_on_the_same_cache(
     assert len(kept) == 6
 
 
-def test_a_second_run_describes_nothing_and_leaves_the_same_table(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def retrieved(name: str) -> dict[str, bytes]:
+def test_a_second_run_describes_nothing_and_leaves_the_same_table(root, tmp_path, monkeypatch):
+    def retrieved(name):
         arguments = [
             "--descriptor",
             "d2",
@@ -214,16 +206,14 @@ def test_a_second_run_describes_nothing_and_leaves_the_same_table(
     first = retrieved("first")
     assert {"scores.json", "ranking.csv"} <= first.keys()
 
-    def described(job: object) -> None:
+    def described(job):
         raise AssertionError("described again")
 
     monkeypatch.setattr("igps.nn.description.describe_timed", described)
     assert retrieved("second") == first
 
 
-def test_only_the_eigenpairs_that_are_needed_are_computed(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_eigenpairs_that_are_needed_are_computed(root, tmp_path, monkeypatch):
     """Unless a number is given, and unless a cache has more."""
     for path in (
         *root.glob("egg/*"),
@@ -232,7 +222,7 @@ def test_only_the_eigenpairs_that_are_needed_are_computed(
         path.unlink()
     options = [option for option in SMALL if option not in ("--signature.n_eigenpairs", "20")]
 
-    def retrieved(cache: str, *more: str) -> tuple[int, np.ndarray]:
+    def retrieved(cache, *more):
         out = tmp_path / "out"
         run(
             monkeypatch,
@@ -250,7 +240,7 @@ def test_only_the_eigenpairs_that_are_needed_are_computed(
                 "distances"
             ]
 
-    def computed(cache: str) -> set[int]:
+    def computed(cache):
         found = set()
         for file in (tmp_path / cache).rglob("*.safetensors"):
             with safe_open(file, framework="numpy") as opened:
@@ -272,9 +262,7 @@ def test_only_the_eigenpairs_that_are_needed_are_computed(
     assert computed("explicit") == {70}
 
 
-def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(root, tmp_path, monkeypatch, capsys):
     (root / "egg" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     arguments = [
         "retrieve",
@@ -311,9 +299,7 @@ def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
     assert not (tmp_path / "out" / "failures.csv").exists()
 
 
-def test_extract_files_and_folder(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_extract_files_and_folder(root, tmp_path, monkeypatch):
     files = [root / "egg" / "1.off", root / "ball" / "0.off"]
     common = ["--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL]
     run(monkeypatch, "extract", *files, "--out", tmp_path / "two.npz", *common)
@@ -321,21 +307,22 @@ def test_extract_files_and_folder(
     with np.load(tmp_path / "two.npz") as two, np.load(tmp_path / "deep" / "all.npz") as everything:
         assert two["names"].tolist() == [str(f) for f in files]
         assert two["features"].shape == (2, 10, 64)
-        np.testing.assert_allclose(two["features"].sum(axis=(1, 2)), 1, atol=1e-5)
+        found = two["features"].sum(axis=(1, 2))
+        np.testing.assert_allclose(found, 1, atol=1e-5)
         assert everything["labels"].tolist() == ["ball"] * 3 + ["egg"] * 3
-        np.testing.assert_allclose(two["features"], everything["features"][[4, 0]], atol=1e-7)
+        expected = everything["features"][[4, 0]]
+        np.testing.assert_allclose(two["features"], expected, atol=1e-7)
 
 
-def test_extract_short_vectors(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_extract_short_vectors(root, tmp_path, monkeypatch, capsys):
     """Of `pretrained`, of which a database takes no more than 256 numbers; a histogram has none."""
     common = ["extract", root / "egg", "--cache_dir", tmp_path / "cache", "--n_workers", "1"]
     run(monkeypatch, *common, "--out", tmp_path / "long.npz")
     run(monkeypatch, *common, "--short", "--out", tmp_path / "short.npz")
     with np.load(tmp_path / "long.npz") as long, np.load(tmp_path / "short.npz") as short:
         assert long["features"].shape[1] > 256 >= short["features"].shape[1]
-        np.testing.assert_allclose(np.linalg.norm(short["features"], axis=1), 1, atol=1e-5)
+        found = np.linalg.norm(short["features"], axis=1)
+        np.testing.assert_allclose(found, 1, atol=1e-5)
         module = descriptor("pretrained")
         assert isinstance(module, EmbeddedDescriptor)
         expected = module.shorten(torch.from_numpy(long["features"])).numpy()
@@ -354,9 +341,7 @@ def test_extract_short_vectors(
     assert not (tmp_path / "none.npz").exists()
 
 
-def test_query_lists_the_nearest(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_query_lists_the_nearest(root, tmp_path, monkeypatch, capsys):
     wanted = tmp_path / "wanted.off"
     wanted.write_bytes((root / "egg" / "1.off").read_bytes())
     run(
@@ -381,7 +366,9 @@ def test_query_lists_the_nearest(
     distances = chi_square(histograms[4:5], histograms)[0]
     names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(3)]
     nearest = torch.argsort(distances, stable=True)[:4].tolist()
-    assert [line.split()[2] for line in lines] == [names[i] for i in nearest]
+    found = [line.split()[2] for line in lines]
+    expected = [names[i] for i in nearest]
+    assert found == expected
     assert [float(line.split()[1]) for line in lines] == pytest.approx(
         distances[nearest].tolist(), rel=5e-3
     )
@@ -416,14 +403,7 @@ def test_query_lists_the_nearest(
         ),
     ],
 )
-def test_errors_are_one_line(
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    message: str,
-) -> None:
+def test_errors_are_one_line(root, tmp_path, monkeypatch, capsys, arguments, message):
     logging.disable(logging.WARNING)
     options = [] if "--paper" in arguments else SMALL
     try:
@@ -443,8 +423,8 @@ def test_errors_are_one_line(
 
 
 def test_too_few_eigenpairs_are_refused_in_the_same_words_as_in_python(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    root, tmp_path, monkeypatch, capsys
+):
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     with pytest.raises(ValueError, match="needs signatures of at least 250, got 20") as raised:
         describe(dataset, descriptor("interior"))
@@ -462,9 +442,7 @@ def test_too_few_eigenpairs_are_refused_in_the_same_words_as_in_python(
         assert f"igps: {raised.value}" in capsys.readouterr().err.splitlines()
 
 
-def test_a_compared_descriptor_retrieves(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_compared_descriptor_retrieves(root, tmp_path, monkeypatch):
     out = tmp_path / "out"
     options = ["--cache_dir", tmp_path / "cache", *SMALL]
     run(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", out, *options)
@@ -478,9 +456,7 @@ def test_a_compared_descriptor_retrieves(
     assert scores["config"]["descriptor"] == "d2"
 
 
-def test_a_mesh_that_cannot_be_described_is_a_failure(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mesh_that_cannot_be_described_is_a_failure(root, tmp_path, monkeypatch, capsys):
     logging.disable(logging.WARNING)
     (root / "egg" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     arguments = [
@@ -513,9 +489,7 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
         logging.disable(logging.NOTSET)
 
 
-def test_an_interruption_is_told_in_a_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interruption_is_told_in_a_line(monkeypatch, capsys):
     monkeypatch.setitem(COMMANDS, "wait", "own_commands:wait")
     with pytest.raises(SystemExit, match="130"):
         run(monkeypatch, "wait")
@@ -525,9 +499,7 @@ def test_an_interruption_is_told_in_a_line(
     )
 
 
-def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_takes_more_memory_than_there_is_is_told_in_a_line(monkeypatch, capsys):
     monkeypatch.setitem(COMMANDS, "ask", "own_commands:ask")
     with pytest.raises(SystemExit, match="2"):
         run(monkeypatch, "ask")
@@ -536,9 +508,7 @@ def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
     )
 
 
-def test_the_version_is_that_of_the_distribution(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_version_is_that_of_the_distribution(monkeypatch, capsys):
     with pytest.raises(SystemExit, match="0"):
         run(monkeypatch, "--version")
     assert capsys.readouterr().out.startswith(
@@ -546,9 +516,7 @@ def test_the_version_is_that_of_the_distribution(
     )
 
 
-def test_json_is_what_the_table_tells(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_is_what_the_table_tells(root, tmp_path, monkeypatch, capsys):
     options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", *SMALL]
     out = tmp_path / "out"
     run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--out", out, "--json", *options)
@@ -575,9 +543,12 @@ def test_json_is_what_the_table_tells(
     histograms = describe(dataset, small_interior())
     distances = chi_square(histograms[1:2], histograms)[0]
     order = distances.argsort()[:3]
-    assert [row["name"] for row in rows] == [dataset.bodies.names[i] for i in order]
-    assert [row["distance"] for row in rows] == pytest.approx(distances[order].tolist(), abs=1e-6)
-    assert (rows[0]["rank"], rows[0]["class"]) == (1, "ball")
+    found = [row["name"] for row in rows]
+    assert found == [dataset.bodies.names[i] for i in order]
+    found = [row["distance"] for row in rows]
+    assert found == pytest.approx(distances[order].tolist(), abs=1e-6)
+    assert rows[0]["rank"] == 1
+    assert rows[0]["class"] == "ball"
     words = [
         "query",
         wanted,
@@ -601,16 +572,14 @@ def test_json_is_what_the_table_tells(
     assert {name: row[name] for name in expected} == pytest.approx(expected)
 
 
-def test_json_has_no_numbers_that_json_does_not_know(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_has_no_numbers_that_json_does_not_know(root, tmp_path, monkeypatch, capsys):
     """The scores of a class of one mesh are not defined."""
     for path in sorted((root / "egg").iterdir())[1:]:
         path.unlink()
     options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", *SMALL]
     run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--json", *options)
 
-    def refuse(name: str) -> None:
+    def refuse(name):
         raise AssertionError(name)
 
     found = json.loads(capsys.readouterr().out, parse_constant=refuse)
@@ -618,9 +587,7 @@ def test_json_has_no_numbers_that_json_does_not_know(
     assert found["n_queries"] == 3
 
 
-def test_json_of_two_bodies_and_of_copies(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_of_two_bodies_and_of_copies(root, tmp_path, monkeypatch, capsys):
     """A body, its copy at twice the size, and another."""
     ball = root / "ball" / "0.off"
     egg = root / "egg" / "0.off"
@@ -633,7 +600,8 @@ def test_json_of_two_bodies_and_of_copies(
     run(monkeypatch, "duplicates", root, *options)
     found = json.loads(capsys.readouterr().out)
     assert found["groups"] == [["egg/0.off", "egg/1.off"]]
-    assert (found["n_files"], found["n_skipped"]) == (3, 0)
+    assert found["n_files"] == 3
+    assert found["n_skipped"] == 0
     (pair,) = found["pairs"]
     assert pair["files"] == ["egg/0.off", "egg/1.off"]
     for other in (larger, ball):
@@ -648,12 +616,8 @@ WRITING = [name for name in COMMANDS if "out" in get_type_hints(load_command(nam
 
 @pytest.mark.parametrize("command", WRITING)
 def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
-    command: str,
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    command, root, tmp_path, monkeypatch, capsys
+):
     endings = ENDINGS.get(command)
     given = [
         *command.split(),
@@ -662,7 +626,7 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
     ]
     name = f"there{(endings or ['.csv'])[0]}"
 
-    def told(place: Path) -> str:
+    def told(place):
         with pytest.raises(SystemExit, match="1"):
             run(monkeypatch, *given, "--out", place)
         return capsys.readouterr().err.splitlines()[-1]
@@ -761,13 +725,8 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
     ],
 )
 def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
-    words: list[str],
-    told: str,
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    words, told, root, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     descriptor("d2").save("plain.safetensors", {})
     shutil.copytree(root / "egg", tmp_path / "TWO")
@@ -782,9 +741,7 @@ def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
     assert capsys.readouterr().err.startswith(f"igps: {told.replace('ROOT', str(root))}")
 
 
-def test_a_list_of_failures_is_no_folder(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_list_of_failures_is_no_folder(root, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
     )
@@ -797,13 +754,12 @@ def test_a_list_of_failures_is_no_folder(
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_completion_knows_commands_and_options(
-    shell: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_completion_knows_commands_and_options(shell, tmp_path, monkeypatch, capsys):
     """The shell itself reads the script, and completes by it."""
     run(monkeypatch, "help", shell)
     script = capsys.readouterr().out
-    assert all(word in script for word in ("retrieve", "doctor", "--mend", "--cache_dir"))
+    for word in ("retrieve", "doctor", "--mend", "--cache_dir"):
+        assert word in script
     program = shutil.which(shell)
     if program is None:
         pytest.skip(f"{shell} is not installed")

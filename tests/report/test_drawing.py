@@ -59,7 +59,8 @@ def test_a_ball_is_a_disc_lit_by_its_normals():
     inside = from_centre < 0.9
     z = np.sqrt(1 - from_centre[inside] ** 2)
     expected = np.clip(0.35 + 0.6 * (0.35 * x[inside] + 0.45 * y[inside] + 0.82 * z), 0, 1)
-    np.testing.assert_allclose(picture[inside, 0], expected * drawing.GREY[0], atol=0.04)
+    found = picture[inside, 0]
+    np.testing.assert_allclose(found, expected * drawing.GREY[0], atol=0.04)
 
 
 def test_turned_body_is_drawn_alike():

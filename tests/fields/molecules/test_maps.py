@@ -1,7 +1,5 @@
 """Density maps become bodies where they lie, against balls and boxes in closed form."""
 
-from __future__ import annotations
-
 import gzip
 
 import numpy as np
