@@ -437,9 +437,9 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
     squares = squared_distances(inner.coordinates(descriptions).double().numpy())
     # The medoids
     pair = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]
-    batches = [dataset.batch([i]) for i in pair]
+    one, other = (dataset.batch([i]) for i in pair)
     first, second = (descriptions[own] for own in members)
-    explanation, is_significant = explain_groups(form, first, second, batches, level=level)
+    explanation, is_significant = explain_groups(form, first, second, [one, other], level=level)
     n_cells = f"{int(is_significant.sum())} of {len(is_significant)}"
     print(f"{n_cells} cells differ significantly; their samples: in the medoid of each group")
     places = places_of_groups(
@@ -459,7 +459,7 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
         [places.painted],
         places.legend,
         [places.words],
-        attributes={name: explain_pair(one, *batches) for name, one in attributes.items()},
+        attributes={name: explain_pair(added, one, other) for name, added in attributes.items()},
     )
 
 

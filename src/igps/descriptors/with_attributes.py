@@ -50,6 +50,7 @@ class WithAttributes(Descriptor):
             )
         self.descriptor = descriptor
         self.scale = scale
+        self.attributes = tuple(attributes)
         self.weights = tuple(weight * scale / SCALES["interior"] for weight in weights)
         embedding = SpectralEmbedding(n_eigenpairs=50)
 
@@ -82,9 +83,8 @@ class WithAttributes(Descriptor):
 
     def of_attributes(self) -> dict[str, HistogramDescriptor]:
         """Return by name what each attribute adds: its histogram, and the weighted distance by it."""
-        pairs = zip(self.inside.parts, self.weights, strict=True)
-        added = [_OfAttribute(histograms, weight) for histograms, weight in pairs]
-        return {one.parts[0][0].axes[0].name: one for one in added}
+        rows = zip(self.attributes, self.inside.parts, self.weights, strict=True)
+        return {name: _OfAttribute(histograms, weight) for name, histograms, weight in rows}
 
     def coordinates(self, descriptions: Tensor, *, within_class: bool = False) -> Tensor:
         """(N, ≤ D + cells) coordinates of the descriptor, then square roots of the weighted histograms."""

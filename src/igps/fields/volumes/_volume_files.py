@@ -119,7 +119,7 @@ def _nibabel(path: Path) -> RawVolume:
 
     image: Any = nibabel.load(path)
     # Of compressed files, nibabel stops behind the last voxel
-    if isinstance(image, nibabel.Nifti1Pair) and path.suffix.lower() == ".gz":
+    if isinstance(image, nibabel.Nifti1Image) and path.suffix.lower() == ".gz":
         with gzip.open(path) as stream:
             volume = of_nibabel(type(image).from_stream(stream), path)
             check_rest(stream, path, n_more=_MAX_TAGS)
