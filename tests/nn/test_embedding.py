@@ -62,9 +62,10 @@ def test_padding_has_no_weight(spectrum, is_learned):
     assert (result[1, :, 5:] == 0).all()
     assert torch.equal(result[0], module(functions, values, area[0]))
     assert torch.equal(result[1, :, :5], module(functions[:, :5], values[:5], area[1]))
-    result.square().sum().backward()
-    assert torch.isfinite(module.log_gain.grad).all()
-    assert (module.log_gain.grad != 0).any()
+    if is_learned:
+        result.square().sum().backward()
+        assert torch.isfinite(module.log_gain.grad).all()
+        assert (module.log_gain.grad != 0).any()
 
 
 def test_keeps_the_first_eigenpairs(spectrum):

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,9 +128,10 @@ def _encoded(surface: PageSurface) -> Record:
 
 
 def _decoded(record: Record) -> PageSurface:
-    facts = json.loads(record.texts["facts"])
-    facts["potential_range"] = tuple(facts["potential_range"])
-    return PageSurface(**{name: record.arrays[name] for name in _ARRAYS}, **facts)
+    fields: dict[str, Any] = json.loads(record.texts["facts"])
+    fields["potential_range"] = tuple(fields["potential_range"])
+    fields |= {name: record.arrays[name] for name in _ARRAYS}
+    return PageSurface(**fields)
 
 
 def surface_of(mesh: Mesh, signature: Signature, n_vertices: int) -> PageSurface:

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics import Metric
-from torchmetrics.utilities import dim_zero_cat
 
 from igps.retrieval.distances import Distance, chi_square
 from igps.retrieval.scores import retrieval_scores
+
+try:
+    from torchmetrics import Metric
+    from torchmetrics.utilities import dim_zero_cat
+except ImportError as error:
+    raise ImportError('needs torchmetrics: pip install "interior-gps[metric]".') from error
 
 
 class RetrievalScoresMetric(Metric):
