@@ -201,12 +201,12 @@ def test_a_file_of_another_kind_is_refused_before_anything_is_computed(
     assert words in capsys.readouterr().err.replace("one of ", "")
 
 
-def test_plain_numbers_alone_need_no_descriptor_and_notes_stand_in_the_row(tmp_path, monkeypatch):
+def test_plain_numbers_alone_need_no_eigenpairs_and_notes_stand_in_the_row(tmp_path, monkeypatch):
     mask = np.zeros((16, 16, 16), dtype=np.uint8)
     mask[2:11, 2:11, 2:11] = 1
     mask[14, 14, 14] = 1
     nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), tmp_path / "cube.nii.gz")
-    words = ["extract", tmp_path, "--out", tmp_path / "plain.csv", "--no_vector"]
+    words = ["extract", tmp_path, "--out", tmp_path / "plain.csv", "--descriptor", "measures"]
     cache = ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
     monkeypatch.setattr("igps.spectra.eigenpairs", None)  # plain numbers need none
     run(monkeypatch, *words, *cache)

@@ -90,7 +90,6 @@ def extract(
     out: Path,
     descriptor: str = "pretrained",
     short: bool = False,
-    no_vector: bool = False,
     wide: bool = False,
     **describing: Any,
 ) -> None:
@@ -98,16 +97,15 @@ def extract(
 
     A table (.csv or .parquet) has one row per body, with the columns file, part, name, class, further columns of
     labels.csv, unit (of length), at_border (share of the surface at the border of the image), border_sides, notes,
-    plain numbers such as volume_mm3, and the description, its columns named after its parts. A NumPy archive (.npz)
-    has features (N, ...) as the descriptor returns them, names (N,), and labels (N,) if the meshes come from a folder
-    with classes.
+    plain numbers such as volume_mm3 (alone with --descriptor measures), and the description, its columns named after
+    its parts. A NumPy archive (.npz) has features (N, ...) as the descriptor returns them, names (N,), and labels (N,)
+    if the meshes come from a folder with classes.
 
     Args:
         meshes: mesh files, or one folder.
         out: file ending in .csv, .parquet or .npz; notes on repaired meshes are written beside it, to a file of the
             same name ending in .notes.csv.
         short: write unit vectors of at most 256 numbers, for search engines that compare by the cosine (pretrained).
-        no_vector: write plain numbers alone, without a descriptor
         wide: write one row per file, or per folder with one mask file per organ, and columns such as PART.volume_mm3
             for each of its bodies.
     """
@@ -118,12 +116,10 @@ def extract(
     from igps.nn.descriptor import EmbeddedDescriptor
 
     is_archive = out.suffix.lower() == ".npz"
-    if is_archive and (wide or no_vector):
+    if is_archive and wide:
         raise ValueError(
             f"out: expected a file of a table ending in {' or '.join(SUFFIXES)}, got {out}."
         )
-    if no_vector:
-        descriptor = "measures"
     module = descriptor_of(descriptor)
     inner = module.descriptor if isinstance(module, SizeAndSide) else module
     if short and not isinstance(inner, EmbeddedDescriptor):

@@ -62,7 +62,7 @@ def test_no_whole_body_is_told_and_every_cut_one(tmp_path, monkeypatch, capsys):
         image = nibabel.Nifti1Image(ball(centre).astype(np.uint8), np.eye(4))
         nibabel.save(image, tmp_path / f"{name}.nii.gz")
     out = tmp_path / "table.csv"
-    words = ["--no_vector", "--cache_dir", tmp_path / "cache", "--n_workers", 1]
+    words = ["--descriptor", "measures", "--cache_dir", tmp_path / "cache", "--n_workers", 1]
     run(monkeypatch, "extract", tmp_path, "--out", out, *words)
     table = pd.read_csv(out, keep_default_na=False).set_index("part")
     assert dict(table["border_sides"]) == {
