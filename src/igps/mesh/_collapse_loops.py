@@ -164,11 +164,13 @@ def _quadrics(points: Floats, faces: Integers) -> Floats:
     quadrics = np.zeros((len(points), 10))
     for face in range(len(faces)):
         a = points[faces[face, 0]]
-        normal = np.cross(points[faces[face, 1]] - a, points[faces[face, 2]] - a)
-        area = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+        nx, ny, nz = _normal(a, points[faces[face, 1]], points[faces[face, 2]])
+        area = math.sqrt(nx * nx + ny * ny + nz * nz)
         if area == 0:
             continue
-        x, y, z = normal / area
+        x = nx / area
+        y = ny / area
+        z = nz / area
         d = x * a[0] + y * a[1] + z * a[2]
         row = (x * x, x * y, x * z, y * y, y * z, z * z, x * d, y * d, z * d, d * d)
         for side in range(3):
@@ -224,15 +226,8 @@ def _turns(rings: _Rings, points: Floats, at_a: Integers, b: int, place: Floats)
         e = rings.vertex[_next(_next(corner))]
         if d == b or e == b:
             continue
-        ux, uy, uz = _difference(points[e], points[d])
-        vx, vy, vz = _difference(points[a], points[d])
-        wx, wy, wz = _difference(place, points[d])
-        ox = uy * vz - uz * vy
-        oy = uz * vx - ux * vz
-        oz = ux * vy - uy * vx
-        nx = uy * wz - uz * wy
-        ny = uz * wx - ux * wz
-        nz = ux * wy - uy * wx
+        ox, oy, oz = _normal(points[a], points[d], points[e])
+        nx, ny, nz = _normal(place, points[d], points[e])
         along = ox * nx + oy * ny + oz * nz
         old = math.sqrt(ox * ox + oy * oy + oz * oz)
         new = math.sqrt(nx * nx + ny * ny + nz * nz)
@@ -243,6 +238,12 @@ def _turns(rings: _Rings, points: Floats, at_a: Integers, b: int, place: Floats)
 
 
 @compiled()
-def _difference(a: Floats, b: Floats) -> tuple[float, float, float]:
-    """Return the vector from b to a."""
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+def _normal(a: Floats, b: Floats, c: Floats) -> tuple[float, float, float]:
+    """Return the normal of a triangle, of twice its area's length."""
+    ux = b[0] - a[0]
+    uy = b[1] - a[1]
+    uz = b[2] - a[2]
+    vx = c[0] - a[0]
+    vy = c[1] - a[1]
+    vz = c[2] - a[2]
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx

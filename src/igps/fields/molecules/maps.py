@@ -68,7 +68,7 @@ def map_surface(grid: Grid, threshold: float, name: str) -> Mesh:
     kept = [part for part, is_small in zip(parts, is_dust, strict=True) if not is_small]
     area = sum(float(face_areas(*part).sum()) for part in kept)
     vertices, faces = simplified_and_joined(kept, _MAX_VERTICES, notes)
-    return Mesh(vertices, faces, name=name, notes=notes, unit="Å", fine_area=area)
+    return Mesh(vertices, faces, name=name, notes=tuple(notes), unit="Å", fine_area=area)
 
 
 def _in_cells(values: Singles, threshold: float) -> Singles:
