@@ -42,7 +42,7 @@ Change = Callable[[Molecule, np.random.Generator], Molecule]
 
 
 def molecules(
-    structures: Path, n_seeds: int = 3, tm_align: bool = False, n_aligned: int = 16
+    structures: Path, n_seeds: int = 3, tm_align: bool = False, n_aligned: int = 12
 ) -> None:
     """Print how well the fold, the composition and the length of chains find conformations and families.
 
