@@ -135,9 +135,7 @@ def _join(near: NearPairs, surfaces: Surfaces, work: _Work) -> Pairs:
         distances = on_threads(
             lambda pair: surfaces.distance(*pair, work.calibration), pairs, work.n_workers
         )
-        bar = Progress(
-            distances, desc="aligned", total=len(pairs), leave=False, disable=not work.progress
-        )
+        bar = Progress(distances, desc="aligned", total=len(pairs), disable=not work.progress)
         for (i, j), distance in zip(pairs, bar, strict=True):
             if distance < math.inf and group.merge(i, j):
                 joined[i, j] = distance
