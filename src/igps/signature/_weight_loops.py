@@ -4,7 +4,7 @@ Points x are (3, n), and close together. The tables of the surface are those of 
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
@@ -15,6 +15,8 @@ from igps._compiled import FUSE, compiled
 SurfaceArrays = tuple[Integers, Floats, Integers, Integers]
 """Faces, table, face_starts and incident_faces of a `HatSurface`."""
 
+# A plain 0 has another type, for which Numba would compile `add_faces` again
+_ZERO = cast(int, np.int64(0))
 # Pairs of a face and a point computed at a time: their data stay in the first-level cache
 _N_PAIRS = 128
 # Half-diagonals; points closer than this are on the surface, or in the plane of a face
@@ -243,7 +245,7 @@ def add_near_faces(
                     n_pairs += 1
             if n_pairs >= _N_PAIRS:
                 add_faces(x, n_pairs, surface, row_of, near, weights, touched, pairs)
-                n_pairs = np.int64(0)
+                n_pairs = _ZERO
     add_faces(x, n_pairs, surface, row_of, near, weights, touched, pairs)
 
 
