@@ -10,6 +10,8 @@ from igps._arrays import Booleans, Floats, Integers, Singles
 from igps._compiled import ALLOCATES, compiled
 
 _TURN = 2 * math.pi
+_SECTOR = _TURN / 32
+_ALL_SECTORS = 2**32 - 1
 
 
 class Balls(NamedTuple):
@@ -154,6 +156,7 @@ def _fill_row(row: Floats, circle: _Circle, start: float, angle: float) -> None:
 def _cover(circle: _Circle, balls: Balls, i: int, j: int, starts: Floats, ends: Floats) -> int:
     """Write the intervals of a circle of balls i and j that other balls cover, and return how many; -1 if all of it."""
     n_covered = 0
+    sectors = 0  # those of 32 that are covered, as bits: most circles are covered before all balls are looked at
     for at in range(balls.first[i], balls.first[i + 1]):
         k = balls.neighbours[at]
         if k == j:
@@ -178,6 +181,10 @@ def _cover(circle: _Circle, balls: Balls, i: int, j: int, starts: Floats, ends: 
         start = math.atan2(b, a) + half
         start -= _TURN * math.floor(start / _TURN)
         end = start + _TURN - 2 * half
+        for sector in range(math.ceil(start / _SECTOR), math.floor(end / _SECTOR)):
+            sectors |= 1 << (sector % 32)
+        if sectors == _ALL_SECTORS:
+            return -1
         starts[n_covered] = start
         ends[n_covered] = end
         n_covered += 1

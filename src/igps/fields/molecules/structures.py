@@ -300,7 +300,7 @@ class _Builder:
             # If names begin in the wrong column, gemmi takes Cα for calcium
             if is_standard and atom.element.name not in _STANDARD_ELEMENTS:
                 atom.element = gemmi.Element("X")
-            if _is_hydrogen(atom) and not self.hydrogens:
+            if not self.hydrogens and _is_hydrogen(atom):
                 continue
             if not math.isfinite(atom.pos.length()):
                 self._count["nowhere"] += 1
