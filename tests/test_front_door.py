@@ -103,6 +103,8 @@ def normal(name):
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+# What a program compares with, and no extra needs.
+COMPARED_WITH = {"radiomics"}
 # Numba works with one version of llvmlite only, and requires it: a range of our own would add nothing.
 BROUGHT_ALONG = {"llvmlite": "numba"}
 
@@ -123,7 +125,7 @@ def test_every_import_is_declared():
     extras = project["optional-dependencies"]
     extras = {name: declared(extras[name]) for name in set(extras) - {"test", "lint", "docs"}}
     optional = set().union(*extras.values()) - {"interior-gps"}
-    known = core | optional | set(BROUGHT_ALONG)
+    known = core | optional | set(BROUGHT_ALONG) | COMPARED_WITH
     used = set()
     for folder in (PACKAGE, PROJECT / "training", PROJECT / "docs" / "benchmarks"):
         for path in sorted(folder.rglob("*.py")):
