@@ -30,7 +30,7 @@ Strided = tuple[np.ndarray, int, int, int]
 def overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Tensor:
     """Return the products (n, m) of rows (n, V) with other rows (m, V), over a piece of the columns.
 
-    For a few long rows NumPy's BLAS takes two thirds of the time of PyTorch's, which is made for Intel processors.
+    For a few long rows NumPy's BLAS takes two thirds of the time of PyTorch's on an AMD processor.
     """
     return torch.from_numpy(rows.numpy()[:, piece] @ others.numpy()[:, piece].T)
 

@@ -17,7 +17,7 @@ Nodes = tuple[int, int]
 """A range of nodes: the first, and the one after the last."""
 
 
-# Rows of `Structure.nodes`. One array in place of seven saves compiled functions a second to compile.
+# Rows of `Structure.nodes`. Compiled functions take longer to compile the more arrays they are given.
 OWN, BOUNDARY, LEFT, RIGHT, BLOCK, UPDATE, CARRIED = range(7)
 
 
