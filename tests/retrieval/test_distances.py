@@ -150,14 +150,6 @@ def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_form
         torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-12)
 
 
-def test_second_derivatives_are_refused():
-    """They would be 0 in silence, for example in a penalty of gradients."""
-    queries = histograms(3, (6,), seed=27, filled=2).requires_grad_()
-    distances = chi_square(queries, histograms(4, (6,), seed=28, filled=2))
-    with pytest.raises(RuntimeError, match="there are no second derivatives"):
-        torch.autograd.grad(distances.sum(), queries, create_graph=True)
-
-
 @pytest.mark.parametrize("distance", ALL)
 def test_gradients_are_finite_at_empty_cells_and_at_distance_zero(distance):
     shapes = histograms(6, (3, 8), seed=16, filled=0.3).requires_grad_()

@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from igps._threads import one_thread
 from igps.data.batch import SignatureBatch
-from igps.retrieval.distances import check_no_graph
 
 BLOCK = 2**25
 """Number of entries in a block; enough to keep a GPU busy."""
@@ -151,8 +151,8 @@ class _OnOneThread(torch.autograd.Function):
         return output
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        check_no_graph()
         with one_thread():
             gradients = torch.autograd.grad(
                 ctx.result,

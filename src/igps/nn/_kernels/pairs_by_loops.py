@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.utils.rnn import pad_sequence
 
 from igps._arrays import Booleans, Floats
@@ -33,7 +34,6 @@ from igps.nn._kernels.pairs_by_torch import (
     with_tensors,
 )
 from igps.nn._precision import full_precision
-from igps.retrieval.distances import check_no_graph
 
 # Maximum numbers of values and of columns in a block, which then stays in a core's second-level cache. A larger block
 # could overflow the integers of `add_whole_pairs`.
@@ -77,9 +77,9 @@ class CompiledCount(torch.autograd.Function):
         return torch.stack(_map_shapes(counts, len(weights)))
 
     @staticmethod
+    @once_differentiable
     @torch.autocast("cpu", enabled=False)
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        check_no_graph()
         weights, *tensors = ctx.saved_tensors
         totals = [torch.zeros_like(tensor) for tensor in (weights, *tensors)]
 
