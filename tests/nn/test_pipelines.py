@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 import igps.nn.functional as functional
-from batches import exported, tensors, two_bodies
+from batches import alone, exported, tensors, two_bodies
 from igps.data.batch import SignatureBatch
 from igps.nn.axes import (
     Attribute,
@@ -137,6 +138,32 @@ def test_double_precision_stays_double(module):
     )
 
 
+def test_transforms_of_functions_follow_a_histogram(module):
+    """`torch.func.grad` gives what a backward pass gives, and `jvp` what it says of a direction."""
+    batch = two_bodies().to(torch.float64)
+    module = module.double().eval()
+    upstream = torch.randn(
+        2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
+
+    def loss(area):
+        return (module(replace(batch, area=area)) * upstream).sum()
+
+    area = batch.area.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(loss(area) + 0 * area.sum(), area)
+    found = torch.func.grad(loss)(batch.area)
+    torch.testing.assert_close(found, expected)
+    direction = torch.tensor([1.0, -2.0]).double()
+    torch.testing.assert_close(
+        torch.func.jvp(loss, (batch.area,), (direction,))[1], expected @ direction
+    )
+    with forward_ad.dual_level():
+        along = forward_ad.unpack_dual(loss(forward_ad.make_dual(batch.area, direction))).tangent
+        torch.testing.assert_close(
+            torch.zeros(()).double() if along is None else along, expected @ direction
+        )
+
+
 def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differences(module):
     """Finite differences at the largest entry; the gradient at padding is 0, also at its infinite eigenvalues."""
     batch = two_bodies().to(torch.float64)
@@ -185,6 +212,37 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
         )
         compared += 1
     assert compared > 0
+
+
+def test_padding_leaves_second_derivatives_as_they_are(module):
+    """Of a body whose samples and eigenvalues are padded, and of the same body alone."""
+    if any(isinstance(one, EmbeddedPairCosines) for one in module.modules()):
+        pytest.skip(
+            "first derivatives only: between points of many coordinates PyTorch has no others"
+        )
+    batch = two_bodies().to(torch.float64)
+    module = module.double()
+    upstream = torch.randn(
+        module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
+    found = []
+    for one, row in ((batch, 1), (alone(batch, 1), 0)):
+        leaves = (one.eigenvalues.clone().requires_grad_(), one.area.clone().requires_grad_())
+        cells = module(replace(one, eigenvalues=leaves[0], area=leaves[1]))[row] * upstream
+        gradients = torch.autograd.grad(cells.sum(), leaves, create_graph=True, allow_unused=True)
+        total = sum(
+            (g.square().sum() for g in gradients if g is not None), torch.zeros(()).double()
+        )
+        second = (
+            torch.autograd.grad(total, leaves, allow_unused=True)
+            if total.requires_grad
+            else (None, None)
+        )
+        found.append([None if values is None else values[row].flatten()[:7] for values in second])
+    for padded, plain in zip(*found, strict=True):
+        assert (padded is None) == (plain is None)
+        if padded is not None and plain is not None:
+            torch.testing.assert_close(padded, plain, rtol=1e-9, atol=1e-12)
 
 
 def test_a_state_is_read_back_to_the_last_key(module):

@@ -6,6 +6,7 @@ import torch
 from scipy.spatial.distance import cdist
 from sklearn.metrics.pairwise import additive_chi2_kernel
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from conftest import torch_threads
@@ -135,6 +136,44 @@ def test_gradients_agree_with_finite_differences(distance):
     assert torch.autograd.gradcheck(distance, (queries, gallery))
 
 
+@pytest.mark.parametrize("distance", ALL)
+@pytest.mark.parametrize("side", [0, 1])
+def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(distance, side):
+    both = [histograms(3, (40,), seed=25), histograms(2, (40,), seed=26)]
+    both[1][1] = both[0][2]  # at distance zero
+    along = histograms(len(both[side]), (40,), seed=29, filled=2)
+    upstream = histograms(3, (2,), seed=30, filled=2)
+    leaf = both[side].requires_grad_()
+    [gradient] = torch.autograd.grad((distance(*both) * upstream).sum(), leaf)
+    expected = (gradient * along).sum()
+
+    def of_side(rows):
+        given = [one.detach() for one in both]
+        given[side] = rows
+        return (distance(*given) * upstream).sum()
+
+    plain = leaf.detach()
+    with forward_ad.dual_level():
+        found = [forward_ad.unpack_dual(of_side(forward_ad.make_dual(plain, along))).tangent]
+    found += [
+        torch.func.jvp(of_side, (plain,), (along,))[1],
+        (torch.func.grad(of_side)(plain) * along).sum(),
+    ]
+    for one in found:
+        torch.testing.assert_close(one, expected, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("distance", ALL)
+def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_differences(distance):
+    queries = histograms(3, (20,), seed=31, filled=2)
+    gallery = histograms(4, (20,), seed=32, filled=2)
+    along = histograms(3, (20,), seed=33, filled=2)
+    gradient = torch.func.grad(lambda rows: distance(rows, gallery).square().sum())
+    found = torch.func.jvp(gradient, (queries,), (along,))[1]
+    expected = (gradient(queries + 1e-6 * along) - gradient(queries - 1e-6 * along)) / 2e-6
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
 def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula():
     queries = histograms(40, (9000,), seed=10, filled=2)
     gallery = histograms(30, (9000,), seed=11, filled=2)
@@ -148,6 +187,19 @@ def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_form
         gradients, torch.autograd.grad((plain * upstream).sum(), arguments), strict=True
     ):
         torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_chi_square_has_second_derivatives_and_none_at_empty_cells():
+    queries = histograms(3, (6,), seed=27, filled=2)
+    gallery = histograms(4, (6,), seed=28, filled=2)
+    leaves = [one.requires_grad_() for one in (queries, gallery)]
+    assert torch.autograd.gradgradcheck(chi_square, leaves)
+    empty = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
+    [first] = torch.autograd.grad(
+        chi_square(empty, torch.zeros(1, 2).double()).sum(), empty, create_graph=True
+    )
+    found = torch.autograd.grad(first.sum(), empty)[0].tolist()
+    assert found == [[0, 0]]
 
 
 @pytest.mark.parametrize("distance", ALL)

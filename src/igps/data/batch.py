@@ -358,7 +358,7 @@ def _flatten_samples(samples: SampleBatch) -> tuple[list[Any], None]:
     return [*tensors, dict(samples.attributes)], None
 
 
-# For `torch.export.export(descriptor, (batch,))`. These two entries in PyTorch's table of containers
+# For `torch.export.export(descriptor, (batch,))` and `torch.func`. These two entries in PyTorch's table of containers
 # are of our own types, so nobody else's programs run otherwise.
 register_pytree_node(
     SignatureBatch,

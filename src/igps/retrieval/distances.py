@@ -3,9 +3,9 @@
 Smaller is closer, identical descriptors have distance exactly 0, and a distance matrix of a set with itself is exactly
 symmetric. All dimensions after the first are cells of a histogram or entries of a vector.
 
-All functions run on the device of their inputs, and in float32 for inputs in half precision. They are differentiable
-once. They raise a ValueError for unsuitable shapes, dtypes or devices, for NaN or infinity, and χ² for negative
-entries; the check waits for the device.
+All functions run on the device of their inputs, and in float32 for inputs in half precision. They are differentiable:
+χ² any number of times, the others once, or any number of times under `torch.func`. They raise a ValueError for
+unsuitable shapes, dtypes or devices, for NaN or infinity, and χ² for negative entries; the check waits for the device.
 """
 
 import math
@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+from torch.autograd import forward_ad
 
 from igps._threads import Team
 from igps.retrieval.distance_loops import fill
@@ -31,6 +31,8 @@ _CELLS_PER_TILE = 4096
 _TRIPLES_PER_THREAD = 2**24
 # Fewer triples take PyTorch less than ten milliseconds; to load the compiled loops takes half a second.
 _MIN_TRIPLES = 2**22
+# Squared distances below this share of the sum of the two squared lengths are rounding errors of double precision.
+_CANCELLATION = 1e-14
 
 
 def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
@@ -39,7 +41,7 @@ def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
     The distance of two histograms of sum 1 lies in [0, 1], and is 1 if no cell is filled in both. To weight a cell,
     multiply its entries in both histograms by the weight. A cell that is empty in both adds nothing; its gradients are
     set to zero, because the function has no derivative there. Memory beyond inputs, result and gradients stays below
-    256 MiB. Source: Rustamov 2010.
+    256 MiB, but derivatives of gradients hold all triples of query, gallery and cell. Source: Rustamov 2010.
 
     Example:
         >>> import torch
@@ -55,6 +57,8 @@ def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
         (Q, G) distances, without unit.
     """
     a, b = _as_rows(queries, gallery, non_negative=True)
+    if in_transforms():
+        return _chi_square_by_torch(a, b)
     return _ChiSquare.apply(a, b)
 
 
@@ -89,9 +93,17 @@ class _ChiSquare(torch.autograd.Function):
         return distances.mul_(0.5)
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         a, b = ctx.saved_tensors
+        if torch.is_grad_enabled():  # derivatives of the gradient are needed, too
+            distances = _chi_square_by_torch(a, b)
+            first_is_needed, second_is_needed = ctx.needs_input_grad
+            gradients: list[Tensor | None] = [None, None]
+            for i, is_needed in enumerate((first_is_needed, second_is_needed)):
+                if is_needed:
+                    leaf = (a, b)[i]
+                    (gradients[i],) = torch.autograd.grad(distances, leaf, grad, create_graph=True)
+            return tuple(gradients)
         grad_a = torch.zeros_like(a)
         grad_b = torch.zeros_like(b)
         for q, g, c in _tiles(a, b):
@@ -104,11 +116,24 @@ class _ChiSquare(torch.autograd.Function):
         return grad_a, grad_b
 
 
+def _chi_square_by_torch(a: Tensor, b: Tensor) -> Tensor:
+    """χ² in operations of PyTorch, which have derivatives of any order and hold arrays (Q, G, cells)."""
+    total = a[:, None] + b
+    filled = total > 0
+    difference = torch.where(filled, a[:, None] - b, 0)
+    return (difference.square() / torch.where(filled, total, 1)).sum(dim=-1) / 2
+
+
 def _uses_loops(a: Tensor, b: Tensor) -> bool:
-    """Whether compiled loops can read rows, on the CPU and not traced, and are worth being loaded."""
-    if a.device.type != "cpu" or torch.compiler.is_compiling():
+    """Whether compiled loops can read rows, on the CPU and not traced or transformed, and are worth being loaded."""
+    if a.device.type != "cpu" or torch.compiler.is_compiling() or in_transforms():
         return False
     return len(a) * len(b) * a.shape[1] > _MIN_TRIPLES
+
+
+def in_transforms() -> bool:
+    """Return whether a transform of `torch.func` or forward-mode differentiation is active."""
+    return torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
 
 
 def _sums_by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
@@ -165,8 +190,27 @@ def _row_distance(a: Tensor, b: Tensor) -> Tensor:
     needs_gradients = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
     if _uses_loops(a, b) and not needs_gradients:
         return _sums_by_loops(a, b, chi_square=False).sqrt_()
-    # The faster matrix product would leave non-zero distances on the diagonal, by cancellation.
-    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+    return row_distances(a, b)
+
+
+# By default without the faster matrix product, whose cancellation leaves non-zero distances on the diagonal.
+def row_distances(
+    a: Tensor, b: Tensor, compute_mode: str = "donot_use_mm_for_euclid_dist"
+) -> Tensor:
+    """Euclidean distances (..., I, J) of rows (..., I, D) and (..., J, D); for the mode see `torch.cdist`."""
+    if not in_transforms():
+        return torch.cdist(a, b, compute_mode=compute_mode)
+    # `torch.cdist` has no forward-mode and no second derivatives. Double precision reduces the product's cancellation.
+    centre = a.detach().mean(dim=-2, keepdim=True)
+    x = (a - centre).double()
+    y = (b - centre).double()
+    x_squares = x.square().sum(dim=-1)
+    y_squares = y.square().sum(dim=-1)
+    sums = x_squares.unsqueeze(-1) + y_squares.unsqueeze(-2)
+    squares = sums - 2 * x @ y.mT
+    is_positive = squares > _CANCELLATION * sums
+    roots = torch.where(is_positive, squares, 1).sqrt()
+    return torch.where(is_positive, roots, 0).to(a.dtype)
 
 
 def square_root(values: Tensor) -> Tensor:

@@ -78,3 +78,24 @@ def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several):
             gradients[i, : gradient.shape[1]], gradient[0], rtol=1e-4, atol=1e-7
         )
         assert not gradients[i, gradient.shape[1] :].any()
+
+
+def test_second_derivatives_of_a_mixed_batch_are_those_of_each_body():
+    descriptor = HistogramDescriptor(PairHistogram(["interior_distance"]))
+    batch = bodies(1, 20, 2)
+
+    def second_derivatives(batch):
+        functions = batch.interior.eigenfunctions.double().requires_grad_()
+        result = descriptor(
+            replace(batch, interior=replace(batch.interior, eigenfunctions=functions))
+        )
+        gradient = torch.autograd.grad(result.square().sum(), functions, create_graph=True)[0]
+        return torch.autograd.grad(gradient.square().sum(), functions)[0]
+
+    found = second_derivatives(batch)
+    for i in range(3):
+        expected = second_derivatives(alone(batch, i))[0]
+        assert expected.any()
+        torch.testing.assert_close(
+            found[i, : len(expected), : expected.shape[1]], expected, rtol=1e-6, atol=1e-12
+        )

@@ -436,6 +436,7 @@ def test_gradcheck(device, layout):
     # A GPU adds in any order.
     some_order = 1e-12 if device == "cuda" else 0
     assert torch.autograd.gradcheck(histogram, leaves, nondet_tol=some_order)
+    assert torch.autograd.gradgradcheck(histogram, leaves, nondet_tol=some_order)
 
 
 @pytest.mark.parametrize("layout", [["many"], ["few", "own"], ["few", "cosines"], ["twists"]])

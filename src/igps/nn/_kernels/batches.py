@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from igps._threads import one_thread
 from igps.data.batch import SignatureBatch
+from igps.retrieval.distances import in_transforms
 
 BLOCK = 2**25
 """Number of entries in a block; enough to keep a GPU busy."""
@@ -22,7 +22,7 @@ _MAX_PADDING, _FREE_PADDING = 0.25, 500
 
 def uses_loops(device: torch.device) -> bool:
     """Whether tensors of a device are processed by compiled loops; otherwise operations of PyTorch are used."""
-    return device.type == "cpu" and not torch.compiler.is_compiling()
+    return device.type == "cpu" and not torch.compiler.is_compiling() and not in_transforms()
 
 
 def map_bodies(
@@ -143,7 +143,10 @@ class _OnOneThread(torch.autograd.Function):
         learned: list[Tensor],
         *_: Tensor,
     ) -> Tensor:
+        ctx.function = function
+        ctx.batch = batch
         ctx.learned = learned
+        ctx.random_state = torch.get_rng_state()
         ctx.result, ctx.aliases = _with_graph(function, batch)
         output: Tensor = ctx.result.detach()
         if not ctx.result.requires_grad:
@@ -151,14 +154,22 @@ class _OnOneThread(torch.autograd.Function):
         return output
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        result = ctx.result
+        aliases = ctx.aliases
+        if torch.is_grad_enabled():
+            # Second derivatives free the graph of the first ones, so these need a graph of their own, of the same
+            # samples.
+            with torch.random.fork_rng(devices=[]):
+                torch.set_rng_state(ctx.random_state)
+                result, aliases = _with_graph(ctx.function, ctx.batch)
         with one_thread():
             gradients = torch.autograd.grad(
-                ctx.result,
-                [*ctx.learned, *ctx.aliases],
+                result,
+                [*ctx.learned, *aliases],
                 upstream,
                 retain_graph=True,  # it is freed with the result
+                create_graph=torch.is_grad_enabled(),
                 allow_unused=True,
             )
         return None, None, None, *gradients

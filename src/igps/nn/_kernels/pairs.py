@@ -1,10 +1,10 @@
 """The count of pairs of points in a product of classes and bins, with two back ends.
 
 All histograms of pairs are computed by `count_pairs`. On the CPU, compiled loops count, with their own gradient
-(`pairs_by_loops`); on other devices and in programs of `torch.export`, operations of PyTorch (`pairs_by_torch`). Both
-back ends count in double precision, do not store a matrix of all pairs, and have gradients by the inputs of the values,
-the weights and the centres. For `torch.compile` the count is a single operator, as compiling the blocks of a few large
-bodies would take minutes.
+(`pairs_by_loops`); on other devices, in programs of `torch.export`, and for second derivatives, operations of PyTorch
+(`pairs_by_torch`). Both back ends count in double precision, do not store a matrix of all pairs, and have gradients by
+the inputs of the values, the weights and the centres. For `torch.compile` the count is a single operator, as compiling
+the blocks of a few large bodies would take minutes.
 """
 
 from collections.abc import Sequence

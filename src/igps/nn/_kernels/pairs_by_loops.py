@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn.utils.rnn import pad_sequence
 
 from igps._arrays import Booleans, Floats
@@ -31,6 +30,7 @@ from igps.nn._kernels.pairs_by_torch import (
     PairValues,
     centres_of,
     cosine_factors,
+    count_by_torch,
     with_tensors,
 )
 from igps.nn._precision import full_precision
@@ -77,10 +77,22 @@ class CompiledCount(torch.autograd.Function):
         return torch.stack(_map_shapes(counts, len(weights)))
 
     @staticmethod
-    @once_differentiable
     @torch.autocast("cpu", enabled=False)
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         weights, *tensors = ctx.saved_tensors
+        if torch.is_grad_enabled():  # for second derivatives, which the loops do not have
+            layout = ctx.shapes.layout
+            needed = ctx.needs_input_grad[1:]
+            counts = count_by_torch(
+                layout.classes, layout.n_classes, layout.pairs, layout.mask, weights, *tensors
+            )
+            leaves = [
+                t for t, is_needed in zip((weights, *tensors), needed, strict=True) if is_needed
+            ]
+            by_leaves = iter(
+                torch.autograd.grad(counts, leaves, upstream, create_graph=True, allow_unused=True)
+            )
+            return None, *(next(by_leaves) if is_needed else None for is_needed in needed)
         totals = [torch.zeros_like(tensor) for tensor in (weights, *tensors)]
 
         def derivatives(number: int, team: Team) -> tuple[Tensor, list[Tensor]]:
