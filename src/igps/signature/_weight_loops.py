@@ -224,9 +224,7 @@ def add_near_faces(
     face_starts = surface[2]
     incident_faces = surface[3]
     n_hats = len(hats)
-    n_pairs = np.int64(
-        0
-    )  # a plain 0 has another type, for which Numba would compile `add_faces` again
+    n_pairs = _ZERO
     for k in range(n_hats):
         hat = hats[k]
         if hat < 0:
