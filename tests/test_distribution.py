@@ -39,7 +39,7 @@ def test_archives_hold_what_the_package_needs(archives):
     package = PROJECT / "src" / "igps"
     wanted = {path.relative_to(package.parent).as_posix() for path in package.rglob("*.py")}
     wanted |= {"igps/py.typed", "igps/report/template/page.html.j2"}
-    wanted.add("igps/descriptors/pretrained/pretrained.safetensors")
+    wanted |= {"igps/descriptors/pretrained/pretrained.safetensors", "igps/learning/train.yaml"}
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     assert wanted <= names

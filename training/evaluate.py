@@ -1,4 +1,4 @@
-"""Score a checkpoint of train.py on the test part of its split.
+"""Score a checkpoint of `igps train` on the test part of its split.
 
     python -m training.evaluate build/own/checkpoints/best.ckpt
 

@@ -7,12 +7,14 @@ import trimesh
 from bodies_on_disk import write_body
 
 from igps.data.batch import SignatureBatch
-from igps.data.datamodule import SignatureDataModule
+from igps.data.datamodule import Batches, SignatureDataModule
+from igps.data.splits import Parts
 from igps.mesh.errors import MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
+FEW = Parts(n_train=2, n_validation=0)
 
 
 @pytest.fixture
@@ -27,12 +29,9 @@ def root(tmp_path):
 def test_loaders_give_the_parts_and_balanced_batches(root, tmp_path):
     module = SignatureDataModule(
         root,
-        "seen",
-        n_train=4,
-        n_validation=2,
-        classes_per_batch=3,
-        shapes_per_class=2,
-        config=CONFIG,
+        Parts("seen", n_train=4, n_validation=2),
+        Batches(n_classes=3, n_per_class=2),
+        CONFIG,
         cache_dir=tmp_path / "cache",
         n_workers=1,
     )
@@ -55,14 +54,11 @@ def test_loaders_give_the_parts_and_balanced_batches(root, tmp_path):
 def test_training_shapes_are_kept_in_memory_thinned(root, tmp_path, n_samples):
     module = SignatureDataModule(
         root,
-        n_train=2,
-        n_validation=0,
-        classes_per_batch=3,
-        shapes_per_class=2,
-        config=CONFIG,
+        FEW,
+        Batches(n_classes=3, n_per_class=2, n_samples=n_samples),
+        CONFIG,
         cache_dir=tmp_path / "cache",
         n_workers=1,
-        n_samples_in_memory=n_samples,
     )
     module.prepare_data()
     items = [module.dataset[i] for i in module.split.train]
@@ -81,19 +77,11 @@ def test_training_shapes_are_kept_in_memory_thinned(root, tmp_path, n_samples):
 
 
 def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(root, tmp_path):
-    def module(**options):
-        return SignatureDataModule(
-            root,
-            n_train=2,
-            n_validation=0,
-            config=CONFIG,
-            cache_dir=tmp_path / "cache",
-            n_workers=1,
-            **options,
-        )
-
-    one = module()
-    other = module(n_loading_workers=2, evaluation_batch_size=4)
+    cache = tmp_path / "cache"
+    one = SignatureDataModule(root, FEW, config=CONFIG, cache_dir=cache, n_workers=1)
+    other = SignatureDataModule(
+        root, FEW, Batches(n_evaluated=4), CONFIG, cache_dir=cache, n_loading_workers=2
+    )
     one.prepare_data()
     other.prepare_data()
     (whole,) = one.test_dataloader()
@@ -101,20 +89,18 @@ def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(root, tmp_path
     assert [len(part) for part in parts] == [4, 4, 1]
     assert sum((part.ids for part in parts), ()) == whole.ids
     assert torch.equal(SignatureBatch.concatenate(parts).interior.points, whole.interior.points)
-    with pytest.raises(ValueError, match="evaluation_batch_size: expected at least 1, got 0"):
-        module(evaluation_batch_size=0)
 
 
-def test_a_single_sample_in_memory_is_refused(root):
-    with pytest.raises(ValueError, match="n_samples_in_memory: expected at least 2, got -3"):
-        SignatureDataModule(root, n_samples_in_memory=-3)
+def test_batches_of_nothing_are_refused():
+    with pytest.raises(ValueError, match="n_evaluated: expected at least 1, got 0"):
+        Batches(n_evaluated=0)
+    with pytest.raises(ValueError, match="n_samples: expected at least 2, got -3"):
+        Batches(n_samples=-3)
 
 
 def test_a_bad_mesh_stops_training(root, tmp_path):
     (root / "class1" / "9.off").write_text("nothing")
-    module = SignatureDataModule(
-        root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1
-    )
+    module = SignatureDataModule(root, FEW, config=CONFIG, cache_dir=tmp_path, n_workers=1)
     with pytest.raises(MeshError, match=r"9\.off"):
         module.prepare_data()
 
@@ -126,9 +112,9 @@ def test_needs_classes(root):
 
 def test_impossible_protocols_are_refused(root):
     with pytest.raises(ValueError, match="protocol: expected one of seen, unseen, got 'some'"):
-        SignatureDataModule(root, "some")
+        SignatureDataModule(root, Parts("some"))
     with pytest.raises(ValueError, match="n_test: expected None with protocol 'seen'"):
-        SignatureDataModule(root, "seen", n_test=2)
+        SignatureDataModule(root, Parts(n_test=2))
 
 
 def test_meshes_are_read_as_asked(root, tmp_path):
@@ -140,8 +126,7 @@ def test_meshes_are_read_as_asked(root, tmp_path):
     def module(**options):
         return SignatureDataModule(
             root,
-            n_train=2,
-            n_validation=0,
+            FEW,
             config=CONFIG,
             cache_dir=tmp_path / "cache",
             n_workers=1,
@@ -154,18 +139,15 @@ def test_meshes_are_read_as_asked(root, tmp_path):
 
 
 def test_nothing_to_validate_on_is_no_loader(root, tmp_path):
-    module = SignatureDataModule(
-        root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1
-    )
+    module = SignatureDataModule(root, FEW, config=CONFIG, cache_dir=tmp_path, n_workers=1)
     assert module.val_dataloader() == []
 
 
 def test_without_a_configuration_a_checkpoint_keeps_nothing_of_the_data(root):
     """Paths and configurations could be read only by running code."""
-    found = SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG).hparams
-    assert found == {}
+    assert SignatureDataModule(root, FEW, config=CONFIG).hparams == {}
 
 
 def test_a_validation_part_without_pairs_is_refused_where_it_is_given(root):
     with pytest.raises(ValueError, match="n_validation: expected at least 2 bodies of a class"):
-        SignatureDataModule(root, n_train=3, n_validation=1, config=CONFIG)
+        SignatureDataModule(root, Parts(n_train=3, n_validation=1), config=CONFIG)

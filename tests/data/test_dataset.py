@@ -13,13 +13,17 @@ from torch.utils.data import DataLoader
 
 import igps
 import igps.data.pipeline as pipeline_module
+from igps.analysis.explanation import explain
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.transforms import FewerSamples
 from igps.failures import Limits, MachineError
 from igps.mesh.errors import MeshError
+from igps.nn.descriptor import HistogramDescriptor
+from igps.nn.histograms import PairHistogram
 from igps.signature.signature import SignatureConfig
+from own_descriptors import small_interior
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
 
@@ -50,6 +54,23 @@ def counted(monkeypatch):
 
     monkeypatch.setattr(pipeline_module, "compute_signature", counting)
     return names
+
+
+def test_a_batch_takes_only_the_samples_that_its_descriptor_reads(dataset, root, tmp_path):
+    inside = small_interior()
+    on_surface = HistogramDescriptor(PairHistogram(samples="surface"))
+    own = SignatureDataset(root, CONFIG, tmp_path / "cache", descriptor=inside)
+    for n_workers in (0, 1):
+        loader = DataLoader(own, batch_size=4, collate_fn=collate, num_workers=n_workers)
+        (batch,) = loader
+        assert batch.surface.points.shape == (4, 0, 3)
+        assert torch.equal(inside(batch), inside(dataset.batch(range(4))))
+    assert len(own[0].signature.surface) == 50
+    with pytest.raises(ValueError, match="batch: expected surface samples, got none"):
+        on_surface(batch)
+    assert torch.equal(igps.describe(own, on_surface), igps.describe(dataset, on_surface))
+    with pytest.raises(ValueError, match="batch: expected surface samples, got none"):
+        explain(inside, own.batch([0]), own.batch([1]))
 
 
 def test_items_are_labelled_and_named(dataset):

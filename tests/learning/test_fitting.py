@@ -178,6 +178,15 @@ def test_fit_takes_size_where_only_size_tells_the_classes_and_says_so(tmp_path):
     assert found.probabilities.argmax(dim=1).tolist() == dataset.labels.tolist()
 
 
+def test_plain_numbers_are_left_out_if_a_body_has_none(dataset):
+    some = dataset.subset(range(8))
+    some.transform = lambda signature: replace(
+        signature, measures={} if signature.name.endswith("3.off") else signature.measures
+    )
+    parts = igps.fit(some, small_interior(), n_workers=1).card["candidates"]
+    assert not any("numbers" in name for name in parts)
+
+
 def test_balanced_accuracy_and_area_count_small_classes_as_much_as_large_ones():
     probabilities = torch.tensor([[0.9, 0.1], [0.8, 0.2], [0.6, 0.4], [0.7, 0.3]])
     labels = torch.tensor([3, 3, 3, 8])

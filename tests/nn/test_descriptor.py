@@ -225,7 +225,9 @@ def test_training_draws_another_subset_each_time(batch):
 def test_needs_are_those_of_all_histograms(batch):
     descriptor = HistogramDescriptor([[small(5, 2), oriented().histograms[0]], small(9, 1)])
     # The embedding of the oriented one takes all that there are.
-    assert descriptor.requirements == Requirements(9, ("surface_direction",), whole_spectrum=True)
+    assert descriptor.requirements == Requirements(
+        9, ("surface_direction",), samples=("interior",), whole_spectrum=True
+    )
     with pytest.raises(
         ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 9, got 7"
     ):

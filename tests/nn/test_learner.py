@@ -1,5 +1,3 @@
-import runpy
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +10,9 @@ from pytorch_metric_learning.losses import TripletMarginLoss
 from torch.utils.data import DataLoader
 
 from igps.data.collation import collate
-from igps.data.datamodule import SignatureDataModule
+from igps.data.datamodule import Batches, SignatureDataModule
+from igps.data.splits import Parts
+from igps.learning.training import train
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor
@@ -39,11 +39,9 @@ def shapes(tmp_path_factory):
 def data(shapes):
     return SignatureDataModule(
         shapes / "meshes",
-        n_train=4,
-        n_validation=2,
-        classes_per_batch=3,
-        shapes_per_class=3,
-        config=CONFIG,
+        Parts(n_train=4, n_validation=2),
+        Batches(n_classes=3, n_per_class=3),
+        CONFIG,
         cache_dir=shapes / "cache",
         n_workers=1,
     )
@@ -398,36 +396,40 @@ def test_a_repeated_shape_counts_once(shapes, tmp_path):
     assert repeated == once
 
 
-def test_the_configuration_trains_and_its_checkpoint_loads_without_running_code(
-    shapes, tmp_path, monkeypatch
-):
+def test_the_configuration_trains_and_its_checkpoint_loads_without_running_code(shapes, tmp_path):
     layout = tmp_path / "small.yaml"
     layout.write_text("parts:\n  - axes: [potential, interior_distance]\n    eigenpairs: 20\n")
-    values = {
-        "model.descriptor.init_args.which": layout,
-        "data.root": shapes / "meshes",
-        "data.cache_dir": shapes / "cache",
-        "data.n_train": 4,
-        "data.n_validation": 2,
-        "data.config.n_eigenpairs": 20,
-        "data.config.resolution": 12,
-        "data.config.min_samples": 0,
-        "data.config.n_surface_samples": 20,
-        "data.n_workers": 1,
-        "trainer.max_epochs": 4,
-        "trainer.accelerator": "cpu",
-        "trainer.enable_progress_bar": "false",
-        "trainer.default_root_dir": tmp_path,
+    signature = {
+        "n_eigenpairs": 20,
+        "resolution": 12,
+        "min_samples": 0,
+        "n_surface_samples": 20,
     }
-    arguments = [f"--{name}={value}" for name, value in values.items()]
-    monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
-    runpy.run_path(str(PROJECT / "training/train.py"), run_name="__main__")
+    values = {
+        "model": {"descriptor": {"init_args": {"which": str(layout)}}},
+        "data": {
+            "root": str(shapes / "meshes"),
+            "cache_dir": str(shapes / "cache"),
+            "parts": {"n_train": 4, "n_validation": 2},
+            "config": signature,
+            "n_workers": 1,
+        },
+        "trainer": {
+            "max_epochs": 4,
+            "accelerator": "cpu",
+            "enable_progress_bar": False,
+            "default_root_dir": str(tmp_path),
+        },
+    }
+    file = tmp_path / "values.yaml"
+    file.write_text(yaml.safe_dump(values))
+    train(file)
     checkpoint = tmp_path / "checkpoints" / "last.ckpt"
     state = torch.load(checkpoint, weights_only=True)["state_dict"]
     assert state["descriptor.histograms.0.embedding.log_gain"].shape == (12,)
     (stored,) = tmp_path.rglob("config.yaml")
     configuration = yaml.safe_load(stored.read_text())
-    assert configuration["data"]["split_seed"] == 0
+    assert configuration["data"]["parts"]["seed"] == 0
     assert configuration["model"]["descriptor"]["init_args"]["learnable"] is True
     checkpoint.rename(tmp_path / "moved.ckpt")  # away from the files beside it
     assert_same(RetrievalLearner.load_from_checkpoint(tmp_path / "moved.ckpt").state_dict(), state)

@@ -3,6 +3,7 @@
 import os
 import re
 from dataclasses import replace
+from pathlib import Path
 from statistics import mean, stdev
 
 import numpy as np
@@ -12,7 +13,6 @@ import yaml
 from docs.benchmarks import learning
 from training.shapes import GradedShapes
 from training.shapes.benchmark import GradedShape, body_of
-from training.train import CONFIG
 
 import igps
 from igps.data.splits import split_seen, split_unseen
@@ -22,6 +22,7 @@ from igps.retrieval import chi_square, retrieval_scores
 from igps.shapes import ArticulatedShapes
 from training import pretrain
 
+CONFIGS = Path(__file__).parents[2] / "configs"
 COLUMNS = ("ft", "nn", "dcg", "st", "adr", "map")
 
 
@@ -135,7 +136,7 @@ class QuickShapes(GradedShapes):
 def test_pretraining_saves_a_metric_and_measures_it(root, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pretrain, "GradedShapes", QuickShapes)
     out = tmp_path / "metric.safetensors"
-    shipped = yaml.safe_load((CONFIG.parent / "pretrain.yaml").read_text())
+    shipped = yaml.safe_load((CONFIGS / "pretrain.yaml").read_text())
     settings = replace(
         pretrain.Settings(**shipped),
         root=tmp_path / "generated",

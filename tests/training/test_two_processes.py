@@ -4,7 +4,8 @@ import pytest
 import torch
 from pytorch_lightning import Trainer, seed_everything
 
-from igps.data.datamodule import SignatureDataModule
+from igps.data.datamodule import Batches, SignatureDataModule
+from igps.data.splits import Parts
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor
@@ -31,11 +32,9 @@ def module(tmp_path_factory):
     ArticulatedShapes(n_classes=3, n_per_class=8, n_vertices=500).write(root / "meshes")
     data = SignatureDataModule(
         root / "meshes",
-        n_train=5,
-        n_validation=3,
-        classes_per_batch=3,
-        shapes_per_class=2,
-        config=CONFIG,
+        Parts(n_train=5, n_validation=3),
+        Batches(n_classes=3, n_per_class=2),
+        CONFIG,
         cache_dir=root / "cache",
         n_workers=1,
     )

@@ -15,7 +15,9 @@ from igps._arrays import Floats
 from igps.analysis.correspondence import dissimilarity
 from igps.analysis.superposition import Movement
 from igps.data.batch import SampleBatch, SignatureBatch
+from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
+from igps.data.requirements import Requirements
 from igps.descriptors.size_and_side import SizeAndSide
 from igps.nn.batch_features import WEIGHT, BatchFeatures
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
@@ -89,6 +91,8 @@ def explain(
         raise ValueError(
             f"one, other: expected batches of one body, got {len(one)} and {len(other)} bodies."
         )
+    for batch in (one, other):
+        Requirements().check(batch)  # samples of the surface show how far places differ
     descriptor = copy.deepcopy(descriptor).double().eval()
     headless = without_head(descriptor)
     pair = (_with_weights(one), _with_weights(other))
@@ -112,7 +116,8 @@ def explain_bodies(
     if moved is not None:
         first, second = (dataset[i].signature.surface.points for i in (0, 1))
         weights = moved.weights(first, second)
-    return explain(descriptor, dataset.batch([0]), dataset.batch([1]), weights)
+    one, other = (collate([dataset[i].signature]) for i in (0, 1))
+    return explain(descriptor, one, other, weights)
 
 
 def _on_surface(values: Floats, like: Shares) -> Shares:

@@ -20,6 +20,7 @@ COMMANDS: Mapping[str, str] = {
     "compare": "igps.cli.compare:compare",
     "fit": "igps.cli.fit:fit",
     "classify": "igps.cli.fit:classify",
+    "train": "igps.cli.train:train",
     "inside": "igps.cli.inside:inside",
     "groups": "igps.cli.answers:groups",
     "explain": "igps.cli.answers:explain",

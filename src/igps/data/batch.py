@@ -17,7 +17,7 @@ from igps._arrays import Floats, Singles
 from igps.data.indices import Indices, resolve_indices, scalar_index
 from igps.mesh.mesh import Mesh
 from igps.signature.measures import POWERS
-from igps.signature.signature import Samples, Signature
+from igps.signature.signature import SAMPLE_KINDS, SampleKind, Samples, Signature
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,7 @@ class LabelledSignature:
     signature: Signature
     label: int
     id: str
+    batched: tuple[SampleKind, ...] = SAMPLE_KINDS  # kinds of samples that a batch takes
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,8 @@ def collate(
 ) -> SignatureBatch:
     """Pad Signatures and collate them to a batch.
 
-    For a `DataLoader(dataset, collate_fn=collate)`.
+    For a `DataLoader(dataset, collate_fn=collate)`. Of a dataset that was made for a descriptor, the batch takes only
+    the kinds of samples that the descriptor reads.
 
     Example:
         >>> import trimesh
@@ -57,10 +58,12 @@ def _single(item: LabelledSignature) -> SignatureBatch:
     measures = None
     if signature.measures:
         measures = _row([signature.measures.get(name, math.nan) for name in POWERS])
+    interior = _samples(signature.interior, "interior" in item.batched)
+    surface = _samples(signature.surface, "surface" in item.batched)
     return SignatureBatch(
         eigenvalues=_row(signature.eigenvalues),
-        interior=_samples(signature.interior),
-        surface=_samples(signature.surface),
+        interior=interior,
+        surface=surface,
         area=_row(signature.area),
         volume=_row(signature.volume),
         labels=_row(item.label, np.int64),
@@ -70,16 +73,17 @@ def _single(item: LabelledSignature) -> SignatureBatch:
     )
 
 
-def _samples(samples: Samples) -> SampleBatch:
+def _samples(samples: Samples, is_read: bool) -> SampleBatch:
     # Centred before the conversion to single precision, where shapes far from the origin would lose digits
     points = samples.points - samples.points.mean(axis=0)
     attributes = {name: _row(v, np.float32) for name, v in sorted(samples.attributes.items())}
-    return SampleBatch(
+    batch = SampleBatch(
         _row(points, np.float32),
         _row(samples.eigenfunctions, np.float32),
         _row(np.ones(len(samples), dtype=bool), bool),
         attributes,
     )
+    return batch if is_read else batch.map(lambda values: values[:, :0])
 
 
 def _row(values: ArrayLike, dtype: type = np.float64) -> Tensor:

@@ -1,21 +1,21 @@
 """Lightning data module of a labelled collection."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
 import torch
 from pytorch_lightning import LightningDataModule
 from pytorch_lightning.core.mixins.hparams_mixin import _given_hyperparameters
 from torch.utils.data import DataLoader, Sampler
 
-from igps._parameters import check_at_least, check_one_of
+from igps._parameters import check_at_least
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.cache import default_cache_dir
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
-from igps.data.splits import SplitProtocol, split_seen, split_unseen
+from igps.data.splits import Parts
 from igps.data.transforms import FewerSamples
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
@@ -25,6 +25,27 @@ def has_configuration() -> bool:
     """Return whether Lightning's command line creates an object from a configuration, which checkpoints can store."""
     # Arguments that are passed in Python would have to be pickled, and loading a pickle can run code
     return _given_hyperparameters.get() is not None
+
+
+@dataclass(frozen=True)
+class Batches:
+    """What the batches of a data module hold.
+
+    Args:
+        n_classes, n_per_class: P and K of a training batch, in each process.
+        n_samples: size of the fixed random subsets of interior and surface samples of each training shape that are kept
+            in memory. If None, whole signatures are read from the cache at each step.
+        n_evaluated: number of shapes in a batch of validation and test.
+    """
+
+    n_classes: int = 10
+    n_per_class: int = 4
+    n_samples: int | None = 1000
+    n_evaluated: int = 16
+
+    def __post_init__(self) -> None:
+        check_at_least(2, n_samples=self.n_samples)
+        check_at_least(1, n_evaluated=self.n_evaluated)
 
 
 class SignatureDataModule(LightningDataModule):
@@ -40,79 +61,42 @@ class SignatureDataModule(LightningDataModule):
         >>> from igps import ArticulatedShapes
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     ArticulatedShapes(3, 6, n_vertices=600).write(folder)
-        ...     data = SignatureDataModule(folder, n_train=4, n_validation=2)
+        ...     data = SignatureDataModule(folder, Parts(n_train=4, n_validation=2))
         >>> len(data.split.train), len(data.split.validation), len(data.split.test)
         (6, 6, 6)
 
     Args:
         root: folder with classes, see `find_bodies`.
-        protocol: see `SplitProtocol`.
-        n_train: number of shapes of each class ("seen") or of classes ("unseen") in training and validation together;
-            a share if below 1.
-        n_validation: how many of these are for validation, 0 or at least 2 of a class; a share if below 1.
-        n_test: number of test classes ("unseen" only); all other classes if None.
-        split_seed: seed of the split.
-        classes_per_batch, shapes_per_class: P and K of a training batch, in each process.
-        n_samples_in_memory: size of the fixed random subsets of interior and surface samples of each training shape
-            that are kept in memory. If None, whole signatures are read from the cache at each step.
+        parts: how the shapes are divided.
+        batches: what a batch holds.
         config, reading: see `SignatureDataset`.
         cache_dir: directory of the signatures; the user's cache directory if None.
         n_workers: number of processes that compute missing signatures; the number of cores if None.
         n_loading_workers: number of processes that read signatures for batches; 0 reads in the main process.
-        evaluation_batch_size: number of shapes in a batch of validation and test.
     """
 
-    def __init__(  # noqa: PLR0913 (Lightning reads the settings of a YAML from it)
+    def __init__(
         self,
         root: Path,
-        protocol: SplitProtocol = "seen",
-        n_train: int | float = 10,
-        n_validation: int | float = 2,
-        n_test: int | None = None,
-        split_seed: int = 0,
-        classes_per_batch: int = 10,
-        shapes_per_class: int = 4,
-        n_samples_in_memory: int | None = 1000,
+        parts: Parts | None = None,
+        batches: Batches | None = None,
         config: SignatureConfig | None = None,
         reading: LoadOptions | None = None,
         cache_dir: Path | None = None,
         n_workers: int | None = None,
         n_loading_workers: int = 0,
-        evaluation_batch_size: int = 16,
     ) -> None:
         super().__init__()
-        check_one_of(get_args(SplitProtocol), protocol=protocol)
-        if protocol == "seen" and n_test is not None:
-            raise ValueError(
-                "n_test: expected None with protocol 'seen', which tests all shapes not trained on."
-            )
-        check_at_least(2, n_samples_in_memory=n_samples_in_memory)
-        check_at_least(1, evaluation_batch_size=evaluation_batch_size)
+        self.batches = batches or Batches()
         if has_configuration():
             self.save_hyperparameters()
         directory = Path(cache_dir or default_cache_dir())
         bodies = find_bodies(root, reading, labelled=True, cache_dir=directory)
         self.dataset = SignatureDataset(bodies, config, directory, reading=reading)
-        self.classes_per_batch = classes_per_batch
-        self.shapes_per_class = shapes_per_class
-        self.n_samples_in_memory = n_samples_in_memory
-        self.evaluation_batch_size = evaluation_batch_size
         self.n_workers = n_workers
         self.n_loading_workers = n_loading_workers
         self._in_memory: SignatureDataset | None = None
-        labels = self.dataset.labels
-        if protocol == "seen":
-            self.split = split_seen(labels, n_train, n_validation=n_validation, seed=split_seed)
-        else:
-            self.split = split_unseen(
-                labels, n_train, n_validation=n_validation, n_test=n_test, seed=split_seed
-            )
-        validation = labels[list(self.split.validation)]
-        if len(validation) and len(validation.unique()) == len(validation):
-            raise ValueError(
-                f"n_validation: expected at least 2 bodies of a class, which retrieve each other, got {n_validation}. "
-                "Give 2 or more, or 0 for no validation."
-            )
+        self.split = (parts or Parts()).split(self.dataset.labels)
 
     def prepare_data(self) -> None:
         """Fill the cache. A mesh that cannot be used stops training, because the split must be complete."""
@@ -127,19 +111,20 @@ class SignatureDataModule(LightningDataModule):
                 'training needs pytorch-metric-learning: pip install "interior-gps[metric]".'
             ) from error
         part = self.dataset.subset(self.split.train)
-        n_batch = min(self.classes_per_batch, len(part.labels.unique())) * self.shapes_per_class
-        # Lightning distributes the drawn shapes to its processes in turn, and each gets `shapes_per_class` of a class
+        n_per_class = self.batches.n_per_class
+        n_batch = min(self.batches.n_classes, len(part.labels.unique())) * n_per_class
+        # Lightning distributes the drawn shapes to its processes in turn, and each gets `n_per_class` of a class
         n_processes = self.trainer.world_size if self.trainer is not None else 1
         sampler = MPerClassSampler(
             part.labels,
-            self.shapes_per_class * n_processes,
+            n_per_class * n_processes,
             batch_size=n_batch * n_processes,
             length_before_new_iter=max(len(part), n_batch * n_processes),
         )
-        if self.n_samples_in_memory is None:
+        n = self.batches.n_samples
+        if n is None:
             return self._loader(part, n_batch, sampler, self.n_loading_workers)
         if self._in_memory is None:
-            n = self.n_samples_in_memory
             self._in_memory = part.to_memory(FewerSamples(n_interior=n, n_surface=n, seed=0))
         # No workers, because there is nothing to read
         return self._loader(self._in_memory, n_batch, sampler, 0)
@@ -159,9 +144,8 @@ class SignatureDataModule(LightningDataModule):
         return batch.to(device, non_blocking=True)
 
     def _evaluation_loader(self, indices: Sequence[int]) -> DataLoader[LabelledSignature]:
-        return self._loader(
-            self.dataset.subset(indices), self.evaluation_batch_size, None, self.n_loading_workers
-        )
+        part = self.dataset.subset(indices)
+        return self._loader(part, self.batches.n_evaluated, None, self.n_loading_workers)
 
     def _loader(
         self, part: SignatureDataset, batch_size: int, sampler: Sampler[int] | None, n_workers: int

@@ -33,7 +33,7 @@ from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import SAMPLE_KINDS, Signature, SignatureConfig
+from igps.signature.signature import SAMPLE_KINDS, SampleKind, Signature, SignatureConfig
 
 
 class SignatureDataset(Dataset[LabelledSignature]):
@@ -55,7 +55,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         config: parameters of the Signatures. The default is 250 eigenpairs, unless the descriptor sets a number.
         cache_dir: directory of the cache; the user's cache directory if None. A cache key is the hash of the content
             of the file, the load options, all parameters, and the version of the algorithm.
-        descriptor: a descriptor, such as `igps.descriptor(NAME)`; the Signatures meet its requirements.
+        descriptor: a descriptor, such as `igps.descriptor(NAME)`; the Signatures meet its requirements, and batches
+            take only the samples that it reads.
         labels: class names of the given paths.
         classes: rule for the class of a body, see `ClassRule`; "folder" if None.
         reading: options for reading files.
@@ -93,10 +94,12 @@ class SignatureDataset(Dataset[LabelledSignature]):
         config = config or SignatureConfig()
         reading = reading or LoadOptions()
         attributes = attributes or {}
+        self._sample_kinds: tuple[SampleKind, ...] = SAMPLE_KINDS
         if descriptor is not None:
             requirements = requirements_of(descriptor)
             config = requirements.apply_to(config)
             attributes = {**requirements.sources, **attributes}
+            self._sample_kinds = requirements.samples
         sources, self._functions = split_attributes(attributes)
         meshes: Mapping[BodyRef, Mesh | MeshError] = {}
         if isinstance(root_or_paths, Mapping):
@@ -179,7 +182,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         label = -1 if self.bodies.labels is None else self.classes.index(self.bodies.labels[i])
         signature = self._signature(i)
         signature = signature if self.transform is None else self.transform(signature)
-        return LabelledSignature(signature, label, self.bodies.names[i])
+        return LabelledSignature(signature, label, self.bodies.names[i], self._sample_kinds)
 
     def _signature(self, i: int) -> Signature:
         """Return a Signature before `transform`."""

@@ -12,7 +12,7 @@ from torch import nn
 from igps.data.added_attributes import AttributeSource
 from igps.data.batch import SignatureBatch
 from igps.signature.attributes import AttributeName
-from igps.signature.signature import SignatureConfig
+from igps.signature.signature import SAMPLE_KINDS, SampleKind, SignatureConfig
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class Requirements:
     attributes: tuple[AttributeName, ...] = ()  # of the samples, see `SignatureConfig`
     mesh: bool = False  # whether the mesh is needed
     eigenpairs: bool = True  # whether any are needed, and not plain numbers or samples alone
+    samples: tuple[SampleKind, ...] = SAMPLE_KINDS  # kinds of samples that are read
     # Whether all eigenpairs are used, so that more would give another descriptor
     whole_spectrum: bool = False
     # Sources of additional attributes by name, which the `attributes` of a SignatureDataset override
@@ -35,6 +36,7 @@ class Requirements:
             attributes=tuple(dict.fromkeys((*self.attributes, *other.attributes))),
             mesh=self.mesh or other.mesh,
             eigenpairs=self.eigenpairs or other.eigenpairs,
+            samples=tuple(k for k in SAMPLE_KINDS if k in (*self.samples, *other.samples)),
             whole_spectrum=self.whole_spectrum or other.whole_spectrum,
             sources={**self.sources, **other.sources},
         )
@@ -62,9 +64,15 @@ class Requirements:
         """Raise a ValueError if a batch does not meet the requirements."""
         if not batch.area.shape[0]:
             raise ValueError("batch: expected at least one shape, got none.")
-        if (
-            self.n_eigenpairs and not torch.compiler.is_compiling()
-        ):  # tracing cannot read values of tensors
+        for kind in self.samples:
+            if getattr(batch, kind).mask.shape[1] == 0:
+                raise ValueError(
+                    f"batch: expected {kind} samples, got none: its dataset was made for a descriptor that does not "
+                    "read them. Give SignatureDataset(descriptor=...) this one, or igps.collate([item.signature])."
+                )
+        # Neither in tracing nor on the device "meta" are there values to read
+        has_values = not torch.compiler.is_compiling() and batch.device.type != "meta"
+        if self.n_eigenpairs and has_values:
             self._check_eigenpairs(int(torch.isfinite(batch.eigenvalues).sum(dim=1).min()))
         self._check_attributes({*batch.interior.attributes, *batch.surface.attributes})
         if self.mesh and batch.meshes is None:

@@ -1,10 +1,12 @@
 """Seeded splits of a labelled collection into training, validation and test."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
+
+from igps._parameters import check_one_of
 
 SplitProtocol = Literal["seen", "unseen"]
 """Whether test classes are seen in training: "seen" splits the shapes of each class, "unseen" splits the classes."""
@@ -17,6 +19,46 @@ class Split:
     train: tuple[int, ...]  # to fit parameters
     validation: tuple[int, ...]  # to choose between models; may be empty
     test: tuple[int, ...]  # for the final evaluation
+
+
+@dataclass(frozen=True)
+class Parts:
+    """How the shapes of a collection are divided.
+
+    Args:
+        protocol: see `SplitProtocol`.
+        n_train: number of shapes of each class ("seen") or of classes ("unseen") in training and validation together;
+            a share if below 1.
+        n_validation: how many of these are for validation, 0 or at least 2 of a class; a share if below 1.
+        n_test: number of test classes ("unseen" only); all other classes if None.
+        seed: of the random numbers.
+    """
+
+    protocol: SplitProtocol = "seen"
+    n_train: int | float = 10
+    n_validation: int | float = 2
+    n_test: int | None = None
+    seed: int = 0
+
+    def split(self, labels: Tensor) -> Split:
+        """Split shapes with labels (N,); raise a ValueError if validation shapes cannot retrieve each other."""
+        check_one_of(get_args(SplitProtocol), protocol=self.protocol)
+        options: dict[str, Any] = {"n_validation": self.n_validation, "seed": self.seed}
+        if self.protocol == "unseen":
+            split = split_unseen(labels, self.n_train, n_test=self.n_test, **options)
+        elif self.n_test is not None:
+            raise ValueError(
+                "n_test: expected None with protocol 'seen', which tests all shapes not trained on."
+            )
+        else:
+            split = split_seen(labels, self.n_train, **options)
+        validation = labels[list(split.validation)]
+        if len(validation) and len(validation.unique()) == len(validation):
+            raise ValueError(
+                "n_validation: expected at least 2 bodies of a class, which retrieve each other, got "
+                f"{self.n_validation}. Give 2 or more, or 0 for no validation."
+            )
+        return split
 
 
 def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed: int = 0) -> Split:

@@ -48,7 +48,7 @@ class Measures(Descriptor):
     """
 
     source = "Zwanenburg et al. 2020 (IBSI); Hildebrand and Rüegsegger 1997"
-    requirements = Requirements(eigenpairs=False)
+    requirements = Requirements(eigenpairs=False, samples=())
     spread: Tensor
     fitted: Tensor
 

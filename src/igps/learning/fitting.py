@@ -6,12 +6,13 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from igps._parameters import check_one_of
+from igps.data.collation import collate
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
@@ -31,10 +32,8 @@ HeadName = Literal["auto", "classifier", "linear", "whitened", "as_is"]
 # Weights of the prior beside a WhitenedHead: equal for new classes, smaller for classes that the head is fitted to
 _PRIOR_SHARES: Mapping[Goal, float] = {"new": 0.5, "known": 1 / 3}
 # For the held-out scores, and within them for the choice of the head
-_N_FOLDS, _N_INNER_FOLDS = (
-    5,
-    3,
-)
+_N_FOLDS = 5
+_N_INNER_FOLDS = 3
 _N_BINS = 10  # of the expected calibration error
 _MIN_GAIN = 0.005  # in the mean of balanced accuracy and AUC, by which a later candidate is better
 _MAX_SCALE_BODIES = 1000  # bodies whose distances determine the scale
@@ -135,7 +134,9 @@ def fit(
     check_classes(dataset.bodies, goal)
     base = copy.deepcopy(base)  # the caller's descriptor stays unchanged
     metric = metric if prior else None
-    rows, dataset = _descriptions(dataset, base, failures, n_workers, progress)
+    options = {"n_workers": n_workers, "progress": progress}
+    histograms, dataset = _histograms(dataset, base, failures, **options)
+    rows = torch.cat([histograms, _numbers(dataset)], dim=1)
     check_classes(dataset.bodies, goal)  # without the bodies that could not be described
     labels = dataset.labels
     counts = Counter(dataset.bodies.labels)
@@ -275,18 +276,11 @@ class _Fitting:
                 x = self.used(candidate, rows)
                 fts.append(_retrieval_means(head, x[out], labels[out])["ft"])
             return {"ft": fmean(fts)} if fts else {}
-        probabilities = []
-        targets = []
+        answers = _Answers(labels.unique())
         for out in folds_of:
             head = self.fit_head(candidate, rows[~out], labels[~out], False)
-            assert isinstance(head, ClassifyingHead)
-            probabilities.append(_of_all_classes(head, self.used(candidate, rows)[out], labels))
-            targets.append(labels[out])
-        if not targets:
-            return {}
-        scores = classification_scores(
-            torch.cat(probabilities), torch.cat(targets), labels.unique()
-        )
+            answers.add(head, self.used(candidate, rows)[out], labels[out])
+        scores = answers.scores()
         return {name: scores[name] for name in ("balanced_accuracy", "auc") if name in scores}
 
     def held_out_scores(
@@ -296,10 +290,9 @@ class _Fitting:
         from sklearn.metrics import roc_auc_score
 
         retrieval: list[dict[str, float]] = []
-        probabilities = []
-        targets = []
         unknown_aucs = []
         classes = labels.unique()
+        answers = _Answers(classes)
         for number, out in enumerate(_held_out(labels, self.goal, _N_FOLDS)):
             chosen, _ = self.choose(rows[~out], labels[~out], candidates)
             if chosen.head == "whitened" and not _has_pair(labels[~out]):
@@ -311,8 +304,7 @@ class _Fitting:
                 retrieval.append({score: scores[score] for score in ("nn", "ft", "dcg")})
             if not isinstance(head, ClassifyingHead):
                 continue
-            probabilities.append(_of_all_classes(head, x[out], labels))
-            targets.append(labels[out])
+            answers.add(head, x[out], labels[out])
             # Classes that are left out of the fit of a second classifier
             is_new = torch.isin(labels, classes[number::_N_FOLDS])
             unknown = out & is_new
@@ -328,8 +320,7 @@ class _Fitting:
             score: fmean(scores[score] for scores in retrieval)
             for score in (retrieval[0] if retrieval else ())
         }
-        if targets:
-            means |= classification_scores(torch.cat(probabilities), torch.cat(targets), classes)
+        means |= answers.scores()
         if unknown_aucs:
             means["unknown_auc"] = fmean(unknown_aucs)
         return means
@@ -344,12 +335,29 @@ def _parts_with_numbers(has_prior: bool) -> list[tuple[bool, tuple[LinearPart, .
     ]
 
 
-def _of_all_classes(head: ClassifyingHead, rows: Tensor, labels: Tensor) -> Tensor:
-    """Return probabilities (N, C) of all classes of the labels; 0 for classes that the head was not fitted to."""
-    classes = labels.unique()
-    probabilities = torch.zeros(len(rows), len(classes))
-    probabilities[:, torch.searchsorted(classes, head.classes)] = head.probabilities(rows)
-    return probabilities
+class _Answers:
+    """Probabilities of held-out bodies, from all folds, and their true classes."""
+
+    def __init__(self, classes: Tensor) -> None:
+        self.classes = classes
+        self.probabilities: list[Tensor] = []
+        self.labels: list[Tensor] = []
+
+    def add(self, head: Head | None, rows: Tensor, labels: Tensor) -> None:
+        """Ask a classifier for the bodies of a fold; classes that it was not fitted to have probability 0."""
+        assert isinstance(head, ClassifyingHead)
+        probabilities = torch.zeros(len(rows), len(self.classes))
+        known = torch.searchsorted(self.classes, head.classes)
+        probabilities[:, known] = head.probabilities(rows)
+        self.probabilities.append(probabilities)
+        self.labels.append(labels)
+
+    def scores(self) -> dict[str, float]:
+        """Return the `classification_scores`; none without folds."""
+        if not self.labels:
+            return {}
+        probabilities = torch.cat(self.probabilities)
+        return classification_scores(probabilities, torch.cat(self.labels), self.classes)
 
 
 def classification_scores(
@@ -420,7 +428,9 @@ def classify(
         raise ValueError(
             f"model: expected names of {len(head.classes)} classes, got {len(names)}. Fit it again."
         )
-    histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
+    histograms, dataset = _histograms(
+        dataset, base, failures, n_workers=n_workers, progress=progress
+    )
     strangeness = head.strangeness(histograms)
     return Classification(
         dataset.bodies.names,
@@ -442,38 +452,22 @@ def classifier_of(model: str | Descriptor) -> tuple[Descriptor, ClassifyingHead]
     return module.descriptor, module.head
 
 
-def _descriptions(
-    dataset: SignatureDataset,
-    base: Descriptor,
-    failures: list[Failure] | None,
-    n_workers: int | None,
-    progress: bool,
-) -> tuple[Tensor, SignatureDataset]:
-    """Return the descriptions by `WithNumbers` of the bodies that can be described, and a dataset of these bodies.
-
-    The numbers are NaN if a body has none, as in files of an earlier version.
-    """
-    histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
-    try:
-        numbers = describe(dataset, Numbers(), n_workers=n_workers)
-    except ValueError:
-        numbers = torch.full((len(dataset), N_NUMBERS + 1), torch.nan)
-    return torch.cat([histograms, numbers], dim=1), dataset
+def _numbers(dataset: SignatureDataset) -> Tensor:
+    """Return the `Numbers` (N, 12 + 1) of N bodies, NaN where a body has none, as in files of an earlier version."""
+    describe_numbers = Numbers()
+    rows = torch.full((len(dataset), N_NUMBERS + 1), torch.nan)
+    for row, item in zip(rows, dataset, strict=True):
+        if item.signature.measures:
+            row.copy_(describe_numbers(collate([item]))[0])
+    return rows
 
 
 def _histograms(
-    dataset: SignatureDataset,
-    base: Descriptor,
-    failures: list[Failure] | None,
-    n_workers: int | None,
-    progress: bool,
+    dataset: SignatureDataset, base: Descriptor, failures: list[Failure] | None, **options: Any
 ) -> tuple[Tensor, SignatureDataset]:
     """Return the histograms (M, cells) of the M bodies that can be described, and a dataset of these bodies."""
-    tag = cache_tag(base)
     n_earlier = len(failures or ())
-    histograms = describe(
-        dataset, base, failures=failures, cache_tag=tag, n_workers=n_workers, progress=progress
-    )
+    histograms = describe(dataset, base, failures=failures, cache_tag=cache_tag(base), **options)
     return histograms.flatten(1), dataset.usable((failures or [])[n_earlier:])
 
 

@@ -17,8 +17,10 @@ from igps._progress import Progress
 from igps._threads import n_cores, one_thread
 from igps.data.attribute_sources import attribute_names
 from igps.data.cache import Record
+from igps.data.collation import collate
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.keys import derived_key
+from igps.data.requirements import Requirements
 from igps.failures import Failed
 from igps.mesh.errors import MeshError
 from igps.nn.axes import Attribute
@@ -214,9 +216,12 @@ def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tup
     """
     descriptor, dataset, device = job
     with one_thread(), torch.inference_mode():  # both apply only to the current thread
-        batch = dataset.batch(range(len(dataset)))
+        requirements = Requirements()
+        if isinstance(descriptor, Descriptor):
+            requirements = descriptor.requirements
+        batch = collate([replace(item, batched=requirements.samples) for item in dataset])
         start = time.process_time()
-        if isinstance(descriptor, Descriptor) and descriptor.requirements.mesh:
+        if requirements.mesh:
             batch = replace(batch, meshes=tuple(dataset.mesh(i) for i in range(len(dataset))))
         values: Singles = descriptor(batch.to(device)).cpu().numpy()
         seconds = time.process_time() - start

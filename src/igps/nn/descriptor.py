@@ -5,6 +5,7 @@ import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import reduce
 from itertools import accumulate
 from operator import or_
@@ -30,7 +31,7 @@ from igps.nn.histograms.base import DescriptionPart
 from igps.nn.specification import Specified, save_module
 from igps.retrieval import chi_square
 from igps.retrieval.vectors import MAX_SHORT_WIDTH, SearchDistance
-from igps.signature.signature import SignatureConfig, compute_signature
+from igps.signature.signature import SAMPLE_KINDS, SignatureConfig, compute_signature
 
 NAME = re.compile(r"\w{1,100}(\+\w{1,40}(=[\d.e-]{1,10})?){0,9}")
 """Pattern for the names of descriptors that can be saved, as file names are derived from these names."""
@@ -273,8 +274,12 @@ class HistogramDescriptor(Descriptor):
         self.name = name
         self.source = source
         self.invariant_to = tuple(invariant_to)
-        self.requirements = reduce(
-            or_, (histogram.requirements for group in groups for histogram in group)
+        flat = [histogram for group in groups for histogram in group]
+        n_read = zip(*(histogram.n_read(training=False) for histogram in flat), strict=True)
+        is_read = dict(zip(SAMPLE_KINDS, map(max, n_read), strict=True))
+        self.requirements = replace(
+            reduce(or_, (histogram.requirements for histogram in flat)),
+            samples=tuple(kind for kind in SAMPLE_KINDS if is_read[kind]),
         )
 
     @property

@@ -42,6 +42,7 @@ class RetrievalLearner(LightningModule):
         >>> from pytorch_lightning import Trainer
         >>> from igps import ArticulatedShapes, HistogramDescriptor, PairHistogram, SignatureConfig
         >>> from igps.data.datamodule import SignatureDataModule
+        >>> from igps.data.splits import Parts
         >>> from igps.nn.heads.learned import BlendedDistance, ProjectionHead
         >>> learner = RetrievalLearner(HistogramDescriptor(PairHistogram()), BlendedDistance(ProjectionHead()))
         >>> trainer = Trainer(
@@ -51,7 +52,7 @@ class RetrievalLearner(LightningModule):
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     ArticulatedShapes(2, 4, n_vertices=600).write(f"{folder}/shapes")
         ...     data = SignatureDataModule(
-        ...         f"{folder}/shapes", n_train=2, n_validation=0, config=SignatureConfig(n_eigenpairs=50),
+        ...         f"{folder}/shapes", Parts(n_train=2, n_validation=0), config=SignatureConfig(n_eigenpairs=50),
         ...         cache_dir=f"{folder}/cache",
         ...     )
         ...     trainer.fit(learner, data)

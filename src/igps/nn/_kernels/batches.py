@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from igps._threads import one_thread
 from igps.data.batch import SignatureBatch
@@ -57,7 +58,7 @@ def map_by_size(
     and surface samples of each body, larger bodies count as of this size. Traced code processes all bodies at once, as
     it cannot depend on their sizes.
     """
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or batch.device.type == "meta":
         return function(batch)
     sizes: list[list[int]] = torch.stack(
         [_last(kind.mask) for kind in (batch.interior, batch.surface)], dim=1
@@ -98,12 +99,8 @@ def map_by_size(
 
 def _last(mask: Tensor) -> Tensor:
     """Return the numbers (N,) of the last true entries of a mask (N, P), counted from 1, or 0 without any."""
-    return (
-        (mask * torch.arange(1, mask.shape[1] + 1, device=mask.device))
-        .cummax(dim=1)
-        .values[:, -1:]
-        .sum(dim=1)
-    )
+    numbers = mask * torch.arange(1, mask.shape[1] + 1, device=mask.device)
+    return functional.pad(numbers, (1, 0)).amax(dim=1)
 
 
 def on_one_thread(

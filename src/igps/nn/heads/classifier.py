@@ -58,7 +58,7 @@ class ClassifyingHead(Head):
         """Return the strangeness (N,) of descriptions; classes are unknown from `strange_from` on."""
 
 
-class ClassifierHead(KernelHead):
+class ClassifierHead(KernelHead, ClassifyingHead):
     """A `KernelHead` whose scores are calibrated on held-out folds of its training shapes.
 
     Probabilities are the softmax of the scores divided by a temperature, which maximises the likelihood of held-out
@@ -73,7 +73,6 @@ class ClassifierHead(KernelHead):
 
     members: Tensor
     calibration: Tensor
-    strange_from: Tensor
 
     def __init__(
         self,
@@ -89,7 +88,6 @@ class ClassifierHead(KernelHead):
         self.names = tuple(names)
         self.register_buffer("members", torch.zeros(0, dtype=torch.long))
         self.register_buffer("calibration", torch.tensor(0.05))
-        self.register_buffer("strange_from", torch.tensor(math.inf))
 
     @torch.no_grad()
     def fit(
@@ -166,6 +164,3 @@ def folds(labels: Tensor, n_folds: int = _MAX_FOLDS) -> Iterator[Tensor]:
     for number in range(n_folds):
         if bool((fold == number).any()):
             yield (fold == number).to(labels.device)
-
-
-ClassifyingHead.register(ClassifierHead)

@@ -57,6 +57,9 @@ class DescriptionPart(Specified, ABC):
         Raises:
             ValueError: a body has fewer than two samples, an attribute is missing, or values are not finite.
         """
+        bodies = batch.batch if isinstance(batch, BatchFeatures) else batch
+        if bodies.device.type == "meta":  # tensors without values
+            return torch.empty(len(bodies), *self.shape, device="meta")
         if isinstance(batch, BatchFeatures):
             return self.of_features(batch)
 

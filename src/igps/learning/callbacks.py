@@ -6,7 +6,6 @@ from statistics import mean
 from typing import Any
 
 import torch
-from matplotlib.figure import Figure
 from pytorch_lightning import Callback, LightningModule, Trainer, seed_everything
 
 
@@ -52,7 +51,7 @@ class SeededEpochs(Callback):
 
 
 class TrainingCurve(Callback):
-    """Write mean loss and validation scores of each epoch to `curve.csv` and `curve.svg` in the folder of the run."""
+    """Write mean loss and validation scores of each epoch to `curve.csv` in the folder of the run."""
 
     def __init__(self) -> None:
         self.rows: list[dict[str, float]] = []
@@ -84,31 +83,13 @@ class TrainingCurve(Callback):
         self._scores = {name: float(value) for name, value in metrics if name.startswith("val_")}
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Add the row of the epoch, and write the files."""
+        """Add the row of the epoch, and write the file."""
         self.rows.append(
             {"epoch": trainer.current_epoch, "train_loss": mean(self._losses), **self._scores}
         )
         if trainer.is_global_zero:
-            self.write(Path(trainer.default_root_dir))
-
-    def write(self, folder: Path) -> None:
-        """Write the table and the plot."""
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "curve.csv").open("w", newline="") as file:
             names = {name: None for row in self.rows for name in row}
-            table = csv.DictWriter(file, list(names))
-            table.writeheader()
-            table.writerows(self.rows)
-        epochs = [row["epoch"] for row in self.rows]
-        losses = [row["train_loss"] for row in self.rows]
-        scored = [row for row in self.rows if "val_ft" in row]
-        figure = Figure(figsize=(6, 3.5), layout="constrained")
-        loss_axis = figure.subplots()
-        loss_axis.plot(epochs, losses, "C0")
-        loss_axis.set(xlabel="epoch", ylabel="loss of the training part")
-        if scored:
-            score_axis = loss_axis.twinx()
-            scored_epochs = [row["epoch"] for row in scored]
-            score_axis.plot(scored_epochs, [row["val_ft"] for row in scored], "C1o-")
-            score_axis.set(ylabel="FT of the validation part", ylim=(0, 1))
-        figure.savefig(folder / "curve.svg")
+            with (Path(trainer.default_root_dir) / "curve.csv").open("w", newline="") as file:
+                table = csv.DictWriter(file, list(names))
+                table.writeheader()
+                table.writerows(self.rows)
