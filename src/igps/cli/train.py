@@ -10,7 +10,8 @@ def train(config: Path, resume: bool = False) -> None:
 
     For most folders igps fit reaches as much, in seconds. Training needs data.root, the folder with one subfolder per
     class, trainer.default_root_dir, the folder of the run, and trainer.max_epochs. It stops when validation no longer
-    improves, and writes model.safetensors for --descriptor, checkpoints, and the curve of loss and validation.
+    improves, and writes layout.safetensors for --descriptor, checkpoints with the head, and the curve of loss and
+    validation.
 
     Args:
         config: YAML file; igps/learning/train.yaml lists every value, its meaning and its default.

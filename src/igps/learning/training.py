@@ -11,7 +11,7 @@ import torch
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 
 from igps.data.datamodule import SignatureDataModule
-from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
+from igps.nn.descriptor import Descriptor
 from igps.nn.learner import RetrievalLearner
 
 logger = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ def train(config: Path, *, resume: bool = False) -> Path:
 
     - `checkpoints/best.ckpt`, by FT of the validation part, and `checkpoints/last.ckpt`, which
       `RetrievalLearner.load_from_checkpoint` and `SignatureDataModule.load_from_checkpoint` read;
-    - `model.safetensors`: the best layout under its head, for `igps.load`;
+    - `layout.safetensors`: the descriptor with the best layout, without the head, for `igps.load`;
     - `curve.csv`: loss and validation scores of each epoch;
     - `config.yaml`: the values of this run.
 
@@ -59,7 +59,7 @@ def train(config: Path, *, resume: bool = False) -> Path:
         resume: continue an interrupted run, to the same weights as without the interruption.
 
     Returns:
-        The path of the model, which is not written if its modules belong to other packages.
+        The path of the layout, which is not written if its modules belong to other packages.
 
     Raises:
         FileNotFoundError: no such file, or nothing to resume.
@@ -86,18 +86,15 @@ def train(config: Path, *, resume: bool = False) -> Path:
     best = run.checkpoints / "best.ckpt"
     stored = torch.load(best if best.exists() else last, map_location="cpu", weights_only=True)
     learner.load_state_dict(stored["state_dict"])
-    path = run.checkpoints.with_name("model.safetensors")
-    _save(learner, path)
+    path = run.checkpoints.with_name("layout.safetensors")
+    if isinstance(learner.descriptor, Descriptor):
+        _save(learner.descriptor, path)
     return path
 
 
-def _save(learner: RetrievalLearner, path: Path) -> None:
-    """Write the layout under its head; only warn about modules of other packages, whose code no file can name."""
-    descriptor = learner.descriptor
-    head = learner.distance.head
-    if not isinstance(descriptor, Descriptor) or head is None:
-        return
+def _save(descriptor: Descriptor, path: Path) -> None:
+    """Write a descriptor; only warn about modules of other packages, whose code no file can name."""
     try:
-        EmbeddedDescriptor(descriptor, head, name="trained").save(path)
+        descriptor.save(path)
     except ValueError as error:
         logger.warning("%s is not written: %s", path, error)

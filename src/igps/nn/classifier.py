@@ -4,6 +4,7 @@ from torch import Tensor, nn
 
 from igps._parameters import check_at_least
 from igps.data.batch import SignatureBatch
+from igps.nn._kernels.batches import on_one_thread
 from igps.nn.descriptor import Descriptor
 from igps.retrieval.distances import square_root
 
@@ -37,7 +38,10 @@ class Classifier(nn.Module):
         )
 
     def forward(self, batch: SignatureBatch) -> Tensor:
-        """Return the logits (N, n_classes) of N shapes."""
+        """Return the logits (N, n_classes) of N shapes; like their gradients, on one thread."""
+        return on_one_thread(self._logits, batch, self)
+
+    def _logits(self, batch: SignatureBatch) -> Tensor:
         cells = self.descriptor(batch).flatten(1).to(next(self.layers.parameters()).dtype)
         logits: Tensor = self.layers(square_root(cells))
         return logits
