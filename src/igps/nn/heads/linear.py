@@ -130,7 +130,7 @@ class LinearHead(ClassifyingHead):
         """Return the matrix (D, ≤ 64 + numbers) from centred columns to those of the regression."""
         n_numbers = self._n_columns()
         n_form = centred.shape[1] - n_numbers
-        spread = centred[:, n_form:].std(dim=0, correction=0)
+        spread = centred[:, n_form:].square().mean(dim=0).sqrt()
         scales = 1 / spread.clamp(min=_MIN_SPREAD)
         if not n_form:
             return scales.diag()
