@@ -864,13 +864,13 @@ def test_bodies_of_one_file_are_laid_together(browser, scans):
         assert visit.shown()[:2] == ["cohort_00.nii.gz#1", "cohort_01.nii.gz#1"]
 
 
-def test_long_names_keep_their_ends(browser, scans):
+def test_long_names_are_shown_whole(browser, scans):
     with Visit(browser, scans) as visit:
-        name = visit.page.locator("#shapes .shape .name").first
-        assert name.evaluate(
-            "e => e.querySelector('.head').scrollWidth > e.querySelector('.head').clientWidth"
-        )
+        shape = visit.page.locator("#shapes .shape").first
+        name = shape.locator(".name")
+        assert name.inner_text() == shape.get_attribute("title")
         assert name.evaluate("e => e.scrollWidth <= e.clientWidth")
+        assert name.evaluate("e => e.scrollHeight <= e.clientHeight")
 
 
 def test_letters_of_the_patient_follow_the_turns(browser, scans):
