@@ -43,9 +43,17 @@ _PROMISES = {
     "batch size": "nothing at all",
     "threads": "nothing at all",
 }
-# A motion moves the body relative to the grid of its samples. A reflection exchanges the corners of faces, which
-# determine the directions of rays.
-_GRID = {"interior", "multiscale", "rich", "pretrained", "inner_distance", "volume_shape_dna"}
+# A motion moves the body relative to the grid of its samples, at which thickness is measured, too. A reflection
+# exchanges the corners of faces, which determine the directions of rays.
+_GRID = {
+    "interior",
+    "multiscale",
+    "rich",
+    "pretrained",
+    "inner_distance",
+    "volume_shape_dna",
+    "measures",
+}
 _RAYS = {"local_diameter_centricity"}
 
 

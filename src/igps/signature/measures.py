@@ -17,10 +17,9 @@ from igps._threads import one_thread
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors, components, directed_edges, undirected_edges, unit
-from igps.signature.sampling import surface_points
 from igps.signature.voxels import interior_samples
 
-MEASURES_VERSION = 6
+MEASURES_VERSION = 7
 """Part of every cache key: raise it whenever the same mesh would give other numbers."""
 
 POWERS: Mapping[str, int] = {
@@ -215,11 +214,15 @@ def local_thickness(mesh: Mesh, points: Floats) -> Floats:
 
 def _even_selection(points: Floats) -> Floats:
     """Return every n-th point by its distance from the middle, so that a turned grid gives the same selection."""
-    distances = np.linalg.norm(points - points.mean(axis=0), axis=1)
-    # Rounded, so that a scaled body does, too: its points are equally far from the middle but for rounding
-    order = np.argsort(np.round(distances / distances.max(), 9), kind="stable")
     every = math.ceil(len(points) / _N_THICKNESS_POINTS)
-    return points[order[every // 2 :: every]]
+    return points[_from_the_middle(points)[every // 2 :: every]]
+
+
+def _from_the_middle(points: Floats) -> Integers:
+    """Return the order (P,) of points (P, 3) by their distance from their middle."""
+    distances = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    # Rounded, so that the order is that of a scaled body: its points are equally far from the middle but for rounding
+    return np.argsort(np.round(distances / distances.max(), 9), kind="stable")
 
 
 def _dots(first: Floats, second: Floats) -> Floats:
@@ -242,11 +245,10 @@ class _NearestPoints:
 
     def __init__(self, mesh: Mesh) -> None:
         n_samples = int(_SAMPLES_PER_THICKNESS * mesh.area**3 / mesh.volume**2)
-        samples = surface_points(mesh, min(n_samples, _MAX_SAMPLES), seed=0)
-        self._samples = samples.positions
+        self._samples, sampled_faces = _even_samples(mesh, min(n_samples, _MAX_SAMPLES))
         # Many samples are equally far from the middle of a body: with large leaves, a query takes half of the time.
         self._tree = cKDTree(self._samples, leafsize=32)
-        self._corners = mesh.vertices[mesh.faces[samples.face]]
+        self._corners = mesh.vertices[mesh.faces[sampled_faces]]
         first = self._corners[:, 1] - self._corners[:, 0]
         second = self._corners[:, 2] - self._corners[:, 0]
         normal = np.cross(first, second)
@@ -283,6 +285,41 @@ class _NearestPoints:
         normals = self._normals[nearest[rows, best % _N_NEAREST]]
         side = np.where(_dots(away, normals) > 0, -1, 1)
         return side * np.sqrt(squared[rows, best]), side[:, None] * unit(away)
+
+
+def _even_samples(mesh: Mesh, n_samples: int) -> tuple[Floats, Integers]:
+    """Return about `n_samples` positions (P, 3) evenly on the surface, and the faces (P,) on which they lie.
+
+    They do not depend on the numbering of faces, as random ones would: from the middle of the body outward, each face
+    gets its share by area, and is halved at its longest edge into as many pieces, whose centres are the samples.
+    """
+    corners = mesh.vertices[mesh.faces]
+    areas = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1)
+    order = _from_the_middle(corners.mean(axis=1))
+    ends = np.cumsum(areas[order]) * (n_samples / areas.sum())
+    shares = np.diff(np.floor(ends), prepend=0)
+    has_share = shares > 0
+    faces = order[has_share]
+    shares = shares[has_share]
+    pieces = corners[faces]
+    # Halves as long as these come nearer to one sample each
+    while shares.max() > math.sqrt(2):
+        is_large = shares > math.sqrt(2)
+        kept = ~is_large
+        pieces = np.concatenate([pieces[kept], *_halves(pieces[is_large])])
+        shares = np.concatenate([shares[kept], *[shares[is_large] / 2] * 2])
+        faces = np.concatenate([faces[kept], *[faces[is_large]] * 2])
+    return pieces.mean(axis=1), faces
+
+
+def _halves(triangles: Floats) -> tuple[Floats, Floats]:
+    """Return both halves (N, 3, 3) of triangles (N, 3, 3) that are cut from the middle of the longest edge."""
+    edges = np.roll(triangles, -1, axis=1) - triangles
+    longest = np.linalg.norm(edges, axis=2).argmax(axis=1)
+    turned = (longest[:, None] + np.arange(3)) % 3
+    start, end, opposite = np.take_along_axis(triangles, turned[..., None], axis=1).swapaxes(0, 1)
+    middle = (start + end) / 2
+    return np.stack([start, middle, opposite], axis=1), np.stack([middle, end, opposite], axis=1)
 
 
 def _moments(mesh: Mesh) -> tuple[Floats, Floats, Floats]:
