@@ -155,8 +155,8 @@ def test_every_command_that_reads_meshes_has_the_choice(command, monkeypatch, ca
 
 
 def test_the_commands_that_read_no_meshes():
-    """The demo makes its own; a report reads those of its results; the others read none."""
-    others = {"report", "demo", "help", "gallery remove", "gallery info"}
+    """The demo makes its own; a report reads those of its results, training those of its file; the others read none."""
+    others = {"report", "demo", "help", "train", "gallery remove", "gallery info"}
     assert set(COMMANDS) - set(READS) == others
 
 

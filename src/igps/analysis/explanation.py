@@ -416,6 +416,8 @@ def explain_groups(
     units = torch.where(is_significant, all_units, 0)
     shares = units * (mean - other_mean)
     parts = _part_shares(descriptor, shares)
+    for batch in batches:
+        Requirements().check(batch)  # samples of both kinds receive shares
     weighted = [_with_weights(batch) for batch in batches]
     samples = _sample_shares(descriptor, weighted, units, shares)
     return Explanation(sum(parts.values()), parts, samples), is_significant

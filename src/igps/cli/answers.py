@@ -417,6 +417,7 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
     from igps.analysis.groups import squared_distances
     from igps.cli.places import places_of_groups
     from igps.cli.reading import described
+    from igps.data.collation import collate
     from igps.descriptors.fingerprint import cache_tag
     from igps.descriptors.size_and_side import SIZE
     from igps.descriptors.with_attributes import split_attributes
@@ -437,7 +438,7 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
     squares = squared_distances(inner.coordinates(descriptions).double().numpy())
     # The medoids
     pair = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]
-    one, other = (dataset.batch([i]) for i in pair)
+    one, other = (collate([dataset[i].signature]) for i in pair)  # with all samples
     first, second = (descriptions[own] for own in members)
     explanation, is_significant = explain_groups(form, first, second, [one, other], level=level)
     n_cells = f"{int(is_significant.sum())} of {len(is_significant)}"
@@ -497,13 +498,14 @@ def _explain_pair(result: Described, pair: list[int], descriptor: str) -> _Expla
     from igps.analysis.explanation import explain as explain_pair
     from igps.analysis.explanation import explain_bodies
     from igps.analysis.superposition import movement
+    from igps.data.collation import collate
     from igps.descriptors.with_attributes import split_attributes
 
     dataset = result.dataset.subset(pair)
     moved = movement(*dataset.bodies)
     form, attributes = split_attributes(result.descriptor)
     explanation = explain_bodies(form, dataset, moved)
-    batches = (dataset.batch([0]), dataset.batch([1]))
+    batches = [collate([item.signature]) for item in dataset]  # with all samples
     painted = [_painted(dataset, i, explanation, i) for i in (0, 1)]
     legend = "share of the distance, over that of an even spread"
     meaning = _meaning(descriptor, dataset, explanation.distance)
