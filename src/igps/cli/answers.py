@@ -505,13 +505,13 @@ def _explain_pair(result: Described, pair: list[int], descriptor: str) -> _Expla
     moved = movement(*dataset.bodies)
     form, attributes = split_attributes(result.descriptor)
     explanation = explain_bodies(form, dataset, moved)
-    batches = [collate([item.signature]) for item in dataset]  # with all samples
+    one, other = (collate([item.signature]) for item in dataset)  # with all samples
     painted = [_painted(dataset, i, explanation, i) for i in (0, 1)]
     legend = "share of the distance, over that of an even spread"
     meaning = _meaning(descriptor, dataset, explanation.distance)
     lines = [meaning or f"what this distance means is known for {CALIBRATED} alone"]
     lines += _extents(painted, moved)
-    told = {name: explain_pair(one, *batches) for name, one in attributes.items()}
+    told = {name: explain_pair(added, one, other) for name, added in attributes.items()}
     return _Explained(
         form.name, dataset, [0, 1], explanation, painted, legend, lines, moved, meaning, told
     )
