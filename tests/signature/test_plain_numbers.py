@@ -148,3 +148,8 @@ def test_thickness_of_a_box_falls_towards_its_edges_as_its_closed_form():
     expected = pytest.approx(2 * low.mean(), rel=0.015)
     assert found["mean_thickness"] == expected
     assert found["greatest_thickness"] == pytest.approx(0.7, rel=0.01)
+
+
+def test_the_thickness_at_a_single_point_is_that_of_its_ball():
+    found = local_thickness(ball(1.5, 1.5, 1.5), np.zeros((1, 3)))
+    assert found == pytest.approx([3.0], rel=0.01)

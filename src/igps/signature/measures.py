@@ -221,8 +221,9 @@ def _even_selection(points: Floats) -> Floats:
 def _from_the_middle(points: Floats) -> Integers:
     """Return the order (P,) of points (P, 3) by their distance from their middle."""
     distances = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    largest = max(distances.max(), np.finfo(float).tiny)  # a single point is the middle
     # Rounded, so that the order is that of a scaled body: its points are equally far from the middle but for rounding
-    return np.argsort(np.round(distances / distances.max(), 9), kind="stable")
+    return np.argsort(np.round(distances / largest, 9), kind="stable")
 
 
 def _dots(first: Floats, second: Floats) -> Floats:
@@ -302,7 +303,7 @@ def _even_samples(mesh: Mesh, n_samples: int) -> tuple[Floats, Integers]:
     faces = order[has_share]
     shares = shares[has_share]
     pieces = corners[faces]
-    # Halves as long as these come nearer to one sample each
+    # Until each piece is about the share of one sample: halves would be farther from it than the whole
     while shares.max() > math.sqrt(2):
         is_large = shares > math.sqrt(2)
         kept = ~is_large
