@@ -4,10 +4,11 @@ The body is a box, of which area, volume and distances are known; nothing but th
 the README runs as it stands there.
 """
 
+import contextlib
 import importlib.metadata
 import itertools
 import re
-import subprocess
+import runpy
 import sys
 import tempfile
 from pathlib import Path
@@ -65,8 +66,9 @@ with tempfile.TemporaryDirectory() as name:
     for number, example in enumerate(
         re.findall(r"^```python\n(.*?)^```", readme, re.DOTALL | re.MULTILINE)
     ):
-        (folder / f"readme{number}").mkdir()
-        (folder / f"example{number}.py").write_text(example)
-        command = [sys.executable, str(folder / f"example{number}.py")]
-        subprocess.run(command, check=True, cwd=folder / f"readme{number}")
+        place = folder / f"readme{number}"
+        place.mkdir()
+        (place / "example.py").write_text(example)
+        with contextlib.chdir(place):
+            runpy.run_path("example.py", run_name="__main__")
 print("works")

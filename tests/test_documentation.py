@@ -7,6 +7,7 @@ import json
 import os
 import pydoc
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -19,7 +20,7 @@ import pytest
 import trimesh
 from sklearn.svm import SVC
 
-from commands import run as run_here
+import commands
 from igps.cli.commands import command_of, load_command
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES
@@ -53,13 +54,38 @@ def python(page):
     return [block for block in blocks(page) if block.language == "python"]
 
 
-def run(folder, *arguments):
+def run_alone(folder, *arguments):
+    """Run Python in a process of its own, and return what it prints."""
     paths = [str(PROJECT / "src"), str(folder), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *arguments]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+@pytest.fixture(scope="session")
+def shared_cache(tmp_path_factory):
+    """Signatures for all pages, many of which make the same bodies; under xdist, for all processes."""
+    base = tmp_path_factory.getbasetemp()
+    place = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder = place / "cache of pages"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, shared_cache):
+    """The current folder, on the path of Python, whose cache is shared. What is imported from it is forgotten."""
+    (tmp_path / "cache").symlink_to(shared_cache)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = set(sys.modules)
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        file = getattr(sys.modules[name], "__file__", None)
+        if file and Path(file).is_relative_to(tmp_path):
+            del sys.modules[name]
 
 
 def install(pyproject, folder):
@@ -135,14 +161,15 @@ def test_readme_is_short_and_has_its_example():
     assert len(python("README.md")) == 1
 
 
-def test_the_ten_lines_print_scores_and_the_nearest(tmp_path):
+def test_the_ten_lines_print_scores_and_the_nearest(folder, capsys):
     example = python("README.md")[0].text
-    (tmp_path / "example.py").write_text(example)
+    (folder / "example.py").write_text(example)
     assert len([line for line in example.splitlines() if line]) <= 10
-    scores, nearest = run(tmp_path, "example.py").splitlines()
+    runpy.run_path("example.py", run_name="__main__")
+    scores, nearest = capsys.readouterr().out.splitlines()
     found = ast.literal_eval(scores)
     assert list(found) == SCORES
-    dataset = SignatureDataset(tmp_path / "shapes", cache_dir=tmp_path / "cache")
+    dataset = SignatureDataset(folder / "shapes", cache_dir=folder / "cache")
     cells = histograms_by_loops(dataset)
     distances = np.array([chi_square(one, cells) for one in cells])
     labels = list(dataset.bodies.labels or ())
@@ -152,23 +179,24 @@ def test_the_ten_lines_print_scores_and_the_nearest(tmp_path):
     assert expected[0] == dataset.bodies.names[0]
 
 
-def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path):
+def test_the_descriptor_of_ones_own_runs_by_its_place(folder, monkeypatch):
     page = python("docs/how-to/add-descriptor.md")
     (mine,) = [block for block in page if block.title == "mine.py"]
-    (tmp_path / "mine.py").write_text(mine.text)
-    ArticulatedShapes(n_classes=2, n_per_class=3, n_vertices=600).write(tmp_path / "shapes")
+    (folder / "mine.py").write_text(mine.text)
+    ArticulatedShapes(n_classes=2, n_per_class=3, n_vertices=600).write(folder / "shapes")
     options = ["--signature.n_eigenpairs", "5", "--n_workers", "1"]
     options += ["--cache_dir", "cache", "--out", "out"]
-    run(tmp_path, "-m", "igps", "retrieve", "shapes", "--descriptor", "mine:Roundness", *options)
-    with np.load(tmp_path / "out" / "distances.npz") as archive:
+    words = ["retrieve", "shapes", "--descriptor", "mine:Roundness", *options]
+    commands.run(monkeypatch, *words)
+    with np.load(folder / "out" / "distances.npz") as archive:
         distances = archive["distances"]
         names = archive["names"]
         labels = archive["labels"]
-    bodies = [trimesh.load(tmp_path / "shapes" / name) for name in names]
+    bodies = [trimesh.load(folder / "shapes" / name) for name in names]
     roundness = np.array([abs(body.volume) / body.area**1.5 for body in bodies])
     expected = np.abs(roundness[:, None] - roundness)
     np.testing.assert_allclose(distances, expected, atol=1e-6)
-    scores = json.loads((tmp_path / "out" / "scores.json").read_text())
+    scores = json.loads((folder / "out" / "scores.json").read_text())
     assert (scores["nn"], scores["ft"]) == pytest.approx(first_tier(distances, list(labels)))
 
 
@@ -178,20 +206,26 @@ def runs_here(page):
 
 
 @pytest.mark.parametrize("page", [page for page in TEXT if runs_here(page)])
-def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page, tmp_path):
-    code, expected = program(page, tmp_path)
+def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page, folder, capsys):
+    code, expected = program(page, folder)
     assert code
     if "MDAnalysis" in code:
         pytest.importorskip("MDAnalysis", reason="reads frames of simulations")
-    (tmp_path / "page.py").write_text(code)
-    printed = run(tmp_path, "page.py")
+    (folder / "page.py").write_text(code)
+    # Where it starts processes, they import it; entry points are read once in a process
+    if "__main__" in code or any(folder.glob("*.dist-info")):
+        (folder / "cache").unlink()
+        printed = run_alone(folder, "page.py")
+    else:
+        runpy.run_path("page.py", run_name="__main__")
+        printed = capsys.readouterr().out
     shown = iter(printed.splitlines())
     # In this order, others between
     missing = [line for line in expected.splitlines() if line not in shown]
     assert not missing, f"{page} shows {missing}, printed was\n{printed}"
     check = CHECKS.get(page)
     if check:
-        check(printed, tmp_path)
+        check(printed, folder)
 
 
 def check_retrieval(printed, folder):
@@ -296,7 +330,7 @@ def commands_told():
 @pytest.mark.parametrize(("command", "lines"), commands_told().items())
 def test_what_igps_is_told_exists(command, lines, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="0"):
-        run_here(monkeypatch, *command.split(), "--help")
+        commands.run(monkeypatch, *command.split(), "--help")
     text = capsys.readouterr().out
     shared = load_command(command).shared_options()
     for line, words in lines:
