@@ -2,6 +2,7 @@
 
 import numpy as np
 import trimesh
+from trimesh.creation import box
 
 N_VERTICES, N_FACES = 162, 320
 """Of the ball that most of the files hold."""
@@ -40,12 +41,12 @@ def write_holed(path, width=1.0, height=1.0):
 
 def write_box(path):
     """A body of eight vertices."""
-    return _written(path, trimesh.creation.box((1, 2, 3)))
+    return _written(path, box((1, 2, 3)))
 
 
 def write_crossing(path):
     """Two unit cubes of twelve triangles that go through each other by half."""
-    boxes = [trimesh.creation.box(), trimesh.creation.box()]
+    boxes = [box(), box()]
     boxes[1].apply_translation([0.5, 0, 0])
     return _written(path, trimesh.util.concatenate(boxes))
 

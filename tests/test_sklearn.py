@@ -3,6 +3,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 from sklearn.model_selection import GridSearchCV
@@ -51,24 +52,24 @@ def test_features_are_the_roots_of_the_histograms(paths, features, tmp_path):
     histograms = describe(dataset, interior(n_eigenpairs=20)).flatten(1).numpy()
     found = features.fit_transform(paths)
     expected = np.sqrt(histograms)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(found, expected, atol=1e-6)
     plain = clone(features).set_params(square_root=False)
     found = plain.transform([str(path) for path in paths])
-    np.testing.assert_allclose(found, histograms, atol=1e-6)
+    assert_allclose(found, histograms, atol=1e-6)
 
 
 def test_meshes_give_what_their_files_give(paths, features):
     meshes = [load_mesh(path) for path in paths[:2]]
     found = features.transform(meshes)
     expected = features.transform(paths[:2])
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(found, expected, atol=1e-6)
 
 
 def test_rich_features_bring_their_attributes(paths, tmp_path):
     rich = VolumetricFeatures("rich", cache_dir=tmp_path, n_workers=1).transform(paths[:1])
     assert rich.shape == (1, 27420)
     found = (rich**2).sum()
-    np.testing.assert_allclose(found, 1, rtol=1e-4)
+    assert_allclose(found, 1, rtol=1e-4)
 
 
 def test_pipeline_classifies(paths, features):
@@ -98,7 +99,7 @@ def test_a_column_of_a_table_is_a_list(paths, features):
     expected = features.transform(paths[:2])
     table = pandas.DataFrame({"file": list(map(str, paths[:2]))})
     for given in (table, table["file"], table.to_numpy()):
-        np.testing.assert_array_equal(features.transform(given), expected)
+        assert_array_equal(features.transform(given), expected)
 
 
 def test_a_file_of_several_bodies_is_no_row(tmp_path):
@@ -127,7 +128,7 @@ def test_descriptions_that_are_no_histograms_are_given_as_they_are(paths, tmp_pa
     features = VolumetricFeatures(D2(), config=CONFIG, cache_dir=tmp_path, n_workers=1)
     expected = describe(SignatureDataset(paths[:2], CONFIG, tmp_path), D2(), n_workers=1)
     found = features.transform(paths[:2])
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(found, expected, atol=1e-6)
 
 
 def test_reading_is_passed_on(paths, tmp_path):
@@ -141,7 +142,7 @@ def test_reading_is_passed_on(paths, tmp_path):
         features.transform([path])
     mended = features.set_params(reading=None).transform([path])
     expected = features.transform(paths[:1])
-    np.testing.assert_allclose(mended, expected, atol=0.05)
+    assert_allclose(mended, expected, atol=0.05)
 
 
 @pytest.mark.parametrize("descriptor", [DISTANCES, interior(n_eigenpairs=3)])
@@ -157,7 +158,7 @@ def test_columns_have_names_and_tables_have_them(paths, tmp_path, descriptor):
     table = clone(features).set_output(transform="pandas").fit_transform(paths)
     assert isinstance(table, pandas.DataFrame)
     assert table.columns.tolist() == names.tolist()
-    np.testing.assert_array_equal(table.to_numpy(), values)
+    assert_array_equal(table.to_numpy(), values)
     # Names of each have the name of the step before them
     union = make_union(clone(features), clone(features)).fit(paths)
     found = len(set(union.get_feature_names_out()))

@@ -6,9 +6,9 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 from pytorch_lightning import Trainer
 from threadpoolctl import threadpool_info
 from torch.utils.data import DataLoader
@@ -264,7 +264,7 @@ def test_calls_on_a_body_leave_the_settings(blob):
         others = list(pool.map(lambda _: igps.compute_signature(blob, CONFIG), range(3)))
     expected = signature.interior.eigenfunctions
     for other in others:
-        np.testing.assert_array_equal(other.interior.eigenfunctions, expected)
+        assert_array_equal(other.interior.eigenfunctions, expected)
     assert settings() == before
 
 
@@ -286,8 +286,8 @@ def test_one_thread_gives_the_numbers_of_many(blob):
     torch.set_num_threads(1)
     one = igps.compute_signature(blob, CONFIG)
     for first, second in ((many.interior, one.interior), (many.surface, one.surface)):
-        np.testing.assert_array_equal(first.eigenfunctions, second.eigenfunctions)
-        np.testing.assert_array_equal(first.points, second.points)
+        assert_array_equal(first.eigenfunctions, second.eigenfunctions)
+        assert_array_equal(first.points, second.points)
 
 
 class Watched(torch.nn.Module):

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from igps.analysis.comparison import compare
 from igps.data.dataset import SignatureDataset
@@ -43,9 +44,7 @@ def test_result_is_what_heights_give(dataset):
     result = run(dataset, Height("tall"))["tall"]
     heights = torch.tensor([1.0, 1.1, 2.3, 2.2, 2.4, 2.6]) * 2
     assert result.distances is not None
-    torch.testing.assert_close(
-        result.distances, (heights[:, None] - heights).abs(), atol=1e-5, rtol=0
-    )
+    assert_close(result.distances, (heights[:, None] - heights).abs(), atol=1e-5, rtol=0)
     assert result.names == dataset.bodies.names
     assert result.labels == ("ball", "ball", "ball", "egg", "egg", "egg")
     row = result.row()
@@ -115,7 +114,7 @@ def test_distances_by_blocks_are_the_same(dataset, monkeypatch):
     whole = run(dataset, Height("tall"))["tall"].distances
     monkeypatch.setattr("igps.analysis.comparison._BLOCK_ENTRIES", 24)
     parts = run(dataset, Height("tall"))["tall"].distances
-    torch.testing.assert_close(parts, whole, rtol=0, atol=0)
+    assert_close(parts, whole, rtol=0, atol=0)
 
 
 def test_processes_give_what_one_does_and_those_that_are_killed_cost_one_mesh_each(dataset):
@@ -128,7 +127,7 @@ def test_processes_give_what_one_does_and_those_that_are_killed_cost_one_mesh_ea
     expected = run(dataset, Height("fine"))["fine"].distances
     assert expected is not None
     assert results["fine"].distances is not None
-    torch.testing.assert_close(results["fine"].distances, expected, rtol=0, atol=0)
+    assert_close(results["fine"].distances, expected, rtol=0, atol=0)
 
 
 def test_signatures_without_what_a_descriptor_needs_are_refused_before_work(dataset):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.linalg import norm
 from sklearn.metrics import roc_auc_score
 
 from conftest import as_mesh
@@ -204,7 +205,7 @@ def test_a_bump_is_painted_where_it_is(signatures, batches):
     places = {kind: getattr(signatures[1], kind).points for kind in ("interior", "surface")}
     points = places["surface"]
     values = share_density(found.samples[1], places, points)
-    at_bump = np.linalg.norm(points - points[points[:, 0].argmax()], axis=1) < 0.25
+    at_bump = norm(points - points[points[:, 0].argmax()], axis=1) < 0.25
     assert values[at_bump].mean() > 2 * abs(values[~at_bump].mean())
 
 
@@ -215,7 +216,7 @@ def test_a_small_bump_or_dent_is_painted_in_another_pose(height):
     straight.vertices *= [0.5, 0.65, 2.0]
     bent = straight.copy()
     bump = straight.vertices[np.abs(straight.vertices - [0.45, 0, 0.8]).sum(axis=1).argmin()]
-    away = np.linalg.norm(straight.vertices - bump, axis=1)
+    away = norm(straight.vertices - bump, axis=1)
     swell = height * np.clip(1 - (away / 0.4) ** 2, 0, 1) ** 2
     bent.vertices += swell[:, None] * straight.vertex_normals
     angle = bent.vertices[:, 2] / 4
@@ -226,7 +227,7 @@ def test_a_small_bump_or_dent_is_painted_in_another_pose(height):
     pair = [compute_signature(as_mesh(one), config) for one in (straight, bent)]
     found = explain(descriptor("interior"), *(collate([one]) for one in pair))
     points = pair[1].surface.points
-    true = np.linalg.norm(points - bent.vertices[away.argmin()], axis=1) < 0.4
+    true = norm(points - bent.vertices[away.argmin()], axis=1) < 0.4
     places = {"interior": pair[1].interior.points, "surface": points}
     assert found.places is not None
     assert roc_auc_score(true, share_density(found.places[1], places, points)) > 0.9

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from igps.analysis.groups import GroupTest, group_test, squared_distances, with_q_values
 
@@ -41,7 +42,7 @@ def whitened_kernel(vectors):
 @pytest.mark.parametrize(("is_confounded", "n_numbers"), [(False, 6), (True, 40)])
 def test_without_a_difference_one_test_in_twenty_rejects(is_confounded, n_numbers):
     """Of 1,000 draws; also where a covariate that differs between the groups, and the strata, cause a difference."""
-    random = np.random.default_rng(1)
+    random = default_rng(1)
     found = []
     for draw in range(1000):
         vectors = random.normal(size=(24, n_numbers))
@@ -60,7 +61,7 @@ def test_without_a_difference_one_test_in_twenty_rejects(is_confounded, n_number
 
 def test_the_unit_of_a_covariate_does_not_matter():
     """Down to one in which all values lie below rounding of numbers about 1; a constant explains nothing."""
-    random = np.random.default_rng(3)
+    random = default_rng(3)
     age = random.normal(size=24) + 7
     vectors = random.normal(size=(24, 3)) + np.outer(age, [2, 1, 0])
     usual = quick(vectors, covariates=age[:, None])
@@ -71,7 +72,7 @@ def test_the_unit_of_a_covariate_does_not_matter():
 
 
 def test_numbers_that_are_none_are_refused():
-    vectors = np.random.default_rng(0).normal(size=(24, 3))
+    vectors = default_rng(0).normal(size=(24, 3))
     with pytest.raises(ValueError, match="n_permutations: expected at least 1, got -3"):
         quick(vectors, n_permutations=-3)
     with pytest.raises(ValueError, match="covariates: expected finite numbers"):
@@ -81,7 +82,7 @@ def test_numbers_that_are_none_are_refused():
 
 
 def test_power_grows_with_the_difference():
-    random = np.random.default_rng(2)
+    random = default_rng(2)
     powers = []
     for shift in (0.0, 0.7, 1.4, 2.8):
         apart = np.outer(np.repeat([0, 1], 12), [shift, 0, 0, 0])
@@ -94,7 +95,7 @@ def test_power_grows_with_the_difference():
 
 
 def test_the_kernel_test_finds_a_small_direction_that_distances_drown():
-    random = np.random.default_rng(9)
+    random = default_rng(9)
     scales = np.array([10.0, 5, 2, 1, 1])
     shift = np.outer(np.repeat([0, 1], 20), [0, 0, 0, 2.0, 0])
     tests = [
@@ -106,7 +107,7 @@ def test_the_kernel_test_finds_a_small_direction_that_distances_drown():
 
 
 def test_a_covariate_that_causes_all_the_difference_explains_it():
-    random = np.random.default_rng(3)
+    random = default_rng(3)
     age = random.normal(size=60) + np.repeat([0, 2], 30)
     vectors = np.outer(age, [1.0, 0.5, 0, 0]) + 0.3 * random.normal(size=(60, 4))
     groups = ["young"] * 30 + ["old"] * 30
@@ -120,7 +121,7 @@ def test_a_covariate_that_causes_all_the_difference_explains_it():
 
 
 def test_statistics_are_those_of_the_textbook():
-    random = np.random.default_rng(4)
+    random = default_rng(4)
     vectors = random.normal(size=(24, 3)) + np.repeat([0, 1], 12)[:, None]
     test = quick(vectors)
     one = vectors[:12]
@@ -143,7 +144,7 @@ def test_statistics_are_those_of_the_textbook():
 
 
 def test_the_interval_covers_the_effect():
-    random = np.random.default_rng(5)
+    random = default_rng(5)
     # means 1 apart, two dimensions of variance 1
     truth = 0.25 / (0.25 + 2)
     covered = []
@@ -156,7 +157,7 @@ def test_the_interval_covers_the_effect():
 
 def test_matched_pairs_without_a_difference_show_no_effect():
     """Over 40 draws the mean AUC is near 0.5, the mean effect near 0, and intervals cover 0."""
-    random = np.random.default_rng(10)
+    random = default_rng(10)
     pairs = [str(i) for i in range(12)] * 2
     found = []
     for draw in range(40):
@@ -173,7 +174,7 @@ def test_matched_pairs_without_a_difference_show_no_effect():
 @pytest.mark.filterwarnings("error")
 def test_what_no_permutation_changes_has_a_probability_of_one():
     """If all bodies but one, or both groups, are equal, p = 1; for groups without scatter it is the least, 1 / 200."""
-    random = np.random.default_rng(11)
+    random = default_rng(11)
     one = np.outer(np.arange(24) == 3, random.normal(size=5))
     twice = np.tile(random.normal(size=(12, 3)), (2, 1))
     for vectors in (one, twice):
@@ -187,7 +188,7 @@ def test_what_no_permutation_changes_has_a_probability_of_one():
 @pytest.mark.filterwarnings("error")
 def test_small_groups_have_an_interval():
     """A bootstrap sample may consist of one body drawn six times, which has no scatter."""
-    random = np.random.default_rng(6)
+    random = default_rng(6)
     vectors = random.normal(size=(12, 3)) + np.repeat([0, 1], 6)[:, None]
     for seed in range(8):
         found = quick(vectors, ["a"] * 6 + ["b"] * 6, seed, n_bootstraps=2000)
@@ -200,7 +201,7 @@ def test_a_probability_is_that_of_all_arrangements():
     """Ten numbers in two groups of five: 252 arrangements, counted one by one."""
     from itertools import combinations
 
-    values = np.random.default_rng(6).normal(size=10) + np.repeat([0, 0.8], 5)
+    values = default_rng(6).normal(size=10) + np.repeat([0, 0.8], 5)
     kernel = whitened_kernel(values[:, None])
     of_means = []
     of_kernel = []
@@ -227,11 +228,11 @@ def test_a_probability_is_that_of_all_arrangements():
             "covariates or strata determine the groups",
         ),
         ({"vectors": np.ones((24, 3))}, "identical"),
-        ({"covariates": np.random.default_rng(0).normal(size=(24, 21))}, "too few"),
+        ({"covariates": default_rng(0).normal(size=(24, 21))}, "too few"),
     ],
 )
 def test_what_makes_no_sense_is_refused(given, why):
-    vectors = np.random.default_rng(7).normal(size=(24, 3))
+    vectors = default_rng(7).normal(size=(24, 3))
     test = quick(**{"vectors": vectors, **given})
     assert test.permanova_p is test.kernel_p is test.effect is None
     assert why in (test.refused or "")
@@ -252,7 +253,7 @@ def test_discovery_rates_are_over_what_was_tested():
 
 
 def test_three_groups_are_tested_together():
-    random = np.random.default_rng(8)
+    random = default_rng(8)
     vectors = random.normal(size=(45, 3)) + np.outer(np.repeat([0, 0, 3], 15), [1, 0, 0])
     test = quick(vectors, ["a"] * 15 + ["b"] * 15 + ["c"] * 15, n_repeats=1)
     assert test.permanova_p == test.kernel_p == 1 / 200

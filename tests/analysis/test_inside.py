@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 
 from igps.analysis.inside import (
     OF_CLASS,
@@ -183,13 +184,11 @@ def test_a_constant_has_no_numbers_that_compare_its_values(made):
 def test_equal_values_share_the_brightest_tenth():
     found = brightest(np.arange(20.0))
     expected = [0] * 18 + [1, 1]
-    np.testing.assert_allclose(found, expected)
+    assert_allclose(found, expected)
     found = brightest(np.array([1.0] * 5 + [0] * 15))
     expected = [0.4] * 5 + [0] * 15
-    np.testing.assert_allclose(found, expected)
-    np.testing.assert_allclose(
-        brightest(np.array([2.0] + [1] * 4 + [0] * 15))[:5], [1] + [0.25] * 4
-    )
+    assert_allclose(found, expected)
+    assert_allclose(brightest(np.array([2.0] + [1] * 4 + [0] * 15))[:5], [1] + [0.25] * 4)
 
 
 def test_a_missing_attribute_and_one_of_several_values_are_refused(made):

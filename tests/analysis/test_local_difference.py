@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from igps.analysis.local_difference import local_difference, misfit, offsets
@@ -15,10 +16,10 @@ def ball(radius, unit=None):
 def test_a_larger_ball_lies_outside_by_the_difference_of_the_radii():
     reference = ball(10.0, "mm")
     found = offsets(ball(12.0, "mm"), reference)
-    np.testing.assert_allclose(found, 2.0, atol=0.08)
-    np.testing.assert_allclose(offsets(ball(1.2, "cm"), reference), found, atol=1e-6)
+    assert_allclose(found, 2.0, atol=0.08)
+    assert_allclose(offsets(ball(1.2, "cm"), reference), found, atol=1e-6)
     at_equal_volume = offsets(ball(12.0, "mm"), reference, keep_size=False)
-    np.testing.assert_allclose(at_equal_volume, 0.0, atol=0.08)
+    assert_allclose(at_equal_volume, 0.0, atol=0.08)
     expected = 2 / (10 * np.sqrt(4 * np.pi))
     assert misfit(found[None], reference) == pytest.approx(expected, rel=0.03)
 
@@ -48,7 +49,7 @@ def test_the_difference_is_the_coefficient_of_the_group_in_a_regression():
     found = local_difference(rows, groups, strata=scanner, covariates=age[:, None])
     columns = np.column_stack([groups == "b", age, scanner == "x", np.ones(40)]).astype(float)
     coefficients = np.linalg.lstsq(columns, rows, rcond=None)[0]
-    np.testing.assert_allclose(found.offset, coefficients[0], rtol=1e-9)
+    assert_allclose(found.offset, coefficients[0], rtol=1e-9)
     assert found.groups == ("a", "b")
     assert np.flatnonzero(found.is_significant).tolist() == [0, 1, 2]
 

@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from scipy.spatial.distance import cdist
 
 from igps.analysis.clusters import STABLE, clusters_of
@@ -11,7 +12,7 @@ from igps.analysis.map import body_map, ends_of_axis
 
 
 def blobs(n_each, centres, scatter, seed=0):
-    random = np.random.default_rng(seed)
+    random = default_rng(seed)
     return np.concatenate(
         [random.normal(centre, scatter, (n_each, len(centre))) for centre in centres]
     )
@@ -19,20 +20,20 @@ def blobs(n_each, centres, scatter, seed=0):
 
 @pytest.mark.parametrize("n", [5, 60])
 def test_points_of_a_plane_keep_all_their_distances(n):
-    points = np.random.default_rng(0).normal(size=(n, 2)) * [3, 1]
+    points = default_rng(0).normal(size=(n, 2)) * [3, 1]
     distances = cdist(points, points)
     found = body_map(distances)
     np.testing.assert_allclose(cdist(found.points, found.points), distances, atol=1e-6)
     assert found.stress < 1e-6
     assert found.points[:, 0].var() > found.points[:, 1].var()
-    order = np.random.default_rng(1).permutation(n)
+    order = default_rng(1).permutation(n)
     shuffled = body_map(distances[np.ix_(order, order)])
     expected = found.points[order]
     np.testing.assert_allclose(shuffled.points, expected, atol=1e-5)
 
 
 def test_the_improved_map_has_less_stress_than_the_classical_one():
-    points = np.random.default_rng(0).normal(size=(40, 6))
+    points = default_rng(0).normal(size=(40, 6))
     distances = cdist(points, points)
     centring = np.eye(40) - 1 / 40
     values, axes = np.linalg.eigh(-centring @ distances**2 @ centring / 2)
@@ -117,7 +118,7 @@ def test_bodies_that_are_alike_are_one_cluster():
 
 
 def test_clusters_of_one_cloud_are_told_unstable():
-    random = np.random.default_rng(3)
+    random = default_rng(3)
     found = []
     for _ in range(5):
         points = random.normal(size=(80, 5))
@@ -132,7 +133,7 @@ def test_a_body_alone_has_no_stability():
     assert np.isnan(clusters_of(cdist(points, points), 2).stability[1])
     pairs = []
     for seed in range(3):
-        points = np.random.default_rng(seed).normal(size=(80, 5))
+        points = default_rng(seed).normal(size=(80, 5))
         found = clusters_of(cdist(points, points), 22, linkage="complete")
         of_two = np.flatnonzero(np.bincount(found.labels) == 2)
         pairs += [found.stability[k] >= STABLE for k in of_two]
@@ -145,11 +146,11 @@ def test_stability_is_the_mean_largest_jaccard_index_of_halves():
     from scipy.cluster.hierarchy import fcluster, linkage
     from scipy.spatial.distance import pdist
 
-    points = np.random.default_rng(4).normal(size=(30, 2)) * [4, 1]
+    points = default_rng(4).normal(size=(30, 2)) * [4, 1]
     found = clusters_of(cdist(points, points), 3, n_resamples=20, seed=5)
     first = [set(np.flatnonzero(found.labels == one).tolist()) for one in range(3)]
 
-    random = np.random.default_rng(5)
+    random = default_rng(5)
     shares = [[], [], []]
     for _ in range(20):
         drawn = np.sort(random.choice(30, 15, replace=False))
@@ -164,7 +165,7 @@ def test_stability_is_the_mean_largest_jaccard_index_of_halves():
 
 
 def test_too_few_bodies_have_no_stability():
-    points = np.random.default_rng(6).normal(size=(4, 2))
+    points = default_rng(6).normal(size=(4, 2))
     assert np.isnan(clusters_of(cdist(points, points), 3).stability).all()
 
 

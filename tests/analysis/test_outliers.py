@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from numpy.random import default_rng
 
 from conftest import as_mesh
 from igps.analysis.groups import squared_distances
@@ -15,7 +16,7 @@ LABELS = ["a"] * 12 + ["b"] * 12
 
 def usual(seed=0):
     """Vectors of two classes."""
-    return np.random.default_rng(seed).normal(size=(24, 8)) + np.repeat([0, 6], 12)[:, None]
+    return default_rng(seed).normal(size=(24, 8)) + np.repeat([0, 6], 12)[:, None]
 
 
 def found_of(vectors, **given):
@@ -39,7 +40,7 @@ def test_bodies_that_the_scan_cut_are_compared_with_their_like():
     vectors = usual()
     vectors[:5] += 20 * np.eye(8)[0]
     vectors[5] += 20 * np.eye(8)[1]
-    volume = 0.01 * np.random.default_rng(0).normal(size=24)
+    volume = 0.01 * default_rng(0).normal(size=24)
     volume[:6] -= np.log(2)
     sides = ["S"] * 5 + ["LI"] + [""] * 18
     measures = {"volume": volume}
@@ -68,7 +69,7 @@ def test_a_body_of_another_shape_comes_first():
 @pytest.mark.parametrize(("n", "n_odd"), [(10, 1), (12, 1), (40, 2)])
 def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n, n_odd):
     """Thirty standard deviations off: an odd body is left out of what is taken to be a tail."""
-    random = np.random.default_rng(n)
+    random = default_rng(n)
     points = random.normal(size=(n, 4))
     volumes = 0.1 * random.normal(size=n)
     volumes[:n_odd] += 3
@@ -79,7 +80,7 @@ def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n, n_odd):
 @pytest.mark.parametrize(("n_subjects", "n_organs"), [(14, 5), (10, 20)])
 def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(n_subjects, n_organs):
     """All lengths of one subject are doubled; the bodies of one subject must not be taken for a tail."""
-    random = np.random.default_rng(n_subjects)
+    random = default_rng(n_subjects)
     n = n_subjects * n_organs
     labels = [f"organ {i % n_organs}" for i in range(n)]
     subjects = np.repeat(np.arange(n_subjects), n_organs)
@@ -122,7 +123,7 @@ def test_a_wrong_label_is_told():
 def test_each_measure_is_a_reason(name, value, told):
     values = np.zeros(24)
     if name in ("volume", "spacing"):
-        values = 0.01 * np.random.default_rng(1).normal(size=24)
+        values = 0.01 * default_rng(1).normal(size=24)
     values[5] = value
     first = found_of(usual(), measures={name: values})[0]
     assert first.body == 5

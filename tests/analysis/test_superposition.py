@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from igps.analysis.superposition import superposition
@@ -17,11 +18,11 @@ def test_the_largest_rigid_part_is_superposed():
     moved = Rotation.from_rotvec([0.0, 0.9, 0.0]).apply(points[away])
     others[away] = turn.inv().apply(moved - [5.0, -2.0, 1.0])
     found = superposition(points, others)
-    np.testing.assert_allclose(found.rotation, turn.as_matrix(), atol=1e-5)
+    assert_allclose(found.rotation, turn.as_matrix(), atol=1e-5)
     expected = [5.0, -2.0, 1.0]
-    np.testing.assert_allclose(found.shift, expected, atol=1e-5)
+    assert_allclose(found.shift, expected, atol=1e-5)
     steps = np.linalg.norm(moved - points[away], axis=1)
-    np.testing.assert_allclose(found.distances[away], steps, atol=1e-4)
+    assert_allclose(found.distances[away], steps, atol=1e-4)
     assert found.distances[~away].max() < 1e-4
 
 

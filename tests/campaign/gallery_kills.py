@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.random import default_rng
 from outcome import Row
 
 import igps.gallery.gallery  # before the forks; this does not import LanceDB, whose threads do not survive a fork
@@ -28,13 +29,13 @@ Rows = dict[str, tuple[float, int]]
 
 
 def vector(seed):
-    values = np.random.default_rng(seed).standard_normal(WIDTH, dtype=np.float32)
+    values = default_rng(seed).standard_normal(WIDTH, dtype=np.float32)
     return values / np.linalg.norm(values)
 
 
 def change(writer, number):
     """A change by a writer: its kind, the chosen ids, and a value."""
-    generator = np.random.default_rng([SEED, writer, number])
+    generator = default_rng([SEED, writer, number])
     chosen = generator.choice(N_IDS, int(generator.integers(1, 60)), replace=False).tolist()
     return str(generator.choice(["add", "add", "remove", "update"])), chosen, number
 
@@ -232,7 +233,7 @@ def campaign(n_kills):
         if not _succeeds(_fork(_create, folder / "gallery.igps")):
             raise RuntimeError("the gallery could not be made")
         while n_killed < n_kills and not missed:
-            generator = np.random.default_rng([SEED, n_rounds])
+            generator = default_rng([SEED, n_rounds])
             n_rounds += 1
             played = _Round(folder, n_rounds, numbers)
             played.wait()

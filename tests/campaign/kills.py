@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from numpy.random import default_rng
 from outcome import Row
 from retrieving import Command, is_python_worker, partials, table, write_shapes
 
@@ -94,7 +95,7 @@ def _workers(folder, expected, n_kills, seconds):
     missed = []
     n_same = n_explained = n_killed = number = 0
     while n_killed < n_kills and number < 4 * n_kills:
-        generator = np.random.default_rng([SEED, 0, number])
+        generator = default_rng([SEED, 0, number])
         run = _Run(folder, f"worker-{number}")
         command = run.command(2)
         run_start = time.monotonic()
@@ -144,7 +145,7 @@ def _parents(folder, expected, n_kills, seconds):
     while n_killed < n_kills and number < 4 * n_kills:
         run = _Run(folder, f"parent-{n_caches}")
         for _ in range(3):
-            generator = np.random.default_rng([SEED, 1, number])
+            generator = default_rng([SEED, 1, number])
             number += 1
             n_workers = 1 + number % 2
             command = run.command(n_workers)
@@ -176,7 +177,7 @@ def _eight(folder, expected, n_kills):
     n_killed = number = n_survivors = 0
     seconds = 1.0
     while n_killed < n_kills and number < 4 * n_kills:
-        generator = np.random.default_rng([SEED, 2, number])
+        generator = default_rng([SEED, 2, number])
         run = _Run(folder, f"eight-{number}")
         run_start = time.monotonic()
         commands = [

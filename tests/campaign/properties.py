@@ -16,6 +16,7 @@ import torch
 import trimesh
 from hypothesis import HealthCheck, Phase, given, seed, settings, target
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from outcome import Row
 from scipy.spatial.transform import Rotation
 
@@ -207,7 +208,7 @@ def _moved_mesh(describer, number, mesh):
 def _motion(describer, data):
     """A rotation and a shift, with or without a reflection."""
     number = data.draw(_numbers)
-    generator = np.random.default_rng(data.draw(_seeds))
+    generator = default_rng(data.draw(_seeds))
     turn = Rotation.from_quat(generator.normal(size=4)).as_matrix() * data.draw(
         st.sampled_from([1.0, -1.0])
     )
@@ -253,14 +254,14 @@ def _many_vertices(describer, data):
 
 
 def _renumbered(mesh, seed):
-    order = np.random.default_rng(seed).permutation(len(mesh.vertices))
+    order = default_rng(seed).permutation(len(mesh.vertices))
     return replace(mesh, vertices=mesh.vertices[order], faces=np.argsort(order)[mesh.faces])
 
 
 def _faces(describer, data):
     number = data.draw(_numbers)
     mesh = bodies()[number]
-    generator = np.random.default_rng(data.draw(_seeds))
+    generator = default_rng(data.draw(_seeds))
     faces = mesh.faces[generator.permutation(len(mesh.faces))]
     start = generator.integers(3, size=(len(faces), 1))
     turned = np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)
@@ -276,7 +277,7 @@ def _subdivision(describer, data):
 def _signs(describer, data):
     """Random signs of all eigenfunctions."""
     number = data.draw(_numbers)
-    generator = np.random.default_rng(data.draw(_seeds))
+    generator = default_rng(data.draw(_seeds))
     signature = describer.signatures[number]
     n_eigenpairs = len(signature.eigenvalues)
     basis = np.diag(generator.choice([-1.0, 1.0], n_eigenpairs))
@@ -287,7 +288,7 @@ def _signs(describer, data):
 def _multiplet(describer, data):
     """A random basis of a multiplet. Neighbouring eigenvalues are averaged before and after the change to make one."""
     number = data.draw(_numbers)
-    generator = np.random.default_rng(data.draw(_seeds))
+    generator = default_rng(data.draw(_seeds))
     signature = describer.signatures[number]
     n_eigenpairs = len(signature.eigenvalues)
     # No descriptor splits one of these multiplets: they use the first 4, 8, 12, 16, 50 and 250 eigenpairs.

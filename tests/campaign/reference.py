@@ -9,6 +9,7 @@ import scipy.linalg
 import scipy.sparse.linalg
 import torch
 import trimesh
+from numpy.linalg import det, norm
 from numpy.typing import NDArray
 
 from igps import PairHistogram, SpectralEmbedding, collate, compute_signature
@@ -221,7 +222,7 @@ def _is_surface(vertices, faces, allow_open):
 def _area_and_volume(vertices, faces):
     area = float(igl.doublearea(vertices, faces).sum() / 2)
     corners = (vertices - vertices.mean(axis=0))[faces]
-    return area, float(np.linalg.det(corners).sum() / 6)
+    return area, float(det(corners).sum() / 6)
 
 
 def _thinness(vertices, faces):
@@ -256,18 +257,16 @@ def mean_values(vertices, faces, points, functions):
     values = np.empty((len(points), functions.shape[1]))
     for i, point in enumerate(points):
         offset = vertices - point
-        distance = np.linalg.norm(offset, axis=1)
+        distance = norm(offset, axis=1)
         u = (offset / distance[:, None])[faces]
-        sides = np.linalg.norm(np.roll(u, -1, axis=1) - np.roll(u, -2, axis=1), axis=2)
+        sides = norm(np.roll(u, -1, axis=1) - np.roll(u, -2, axis=1), axis=2)
         angles = 2 * np.arcsin(np.clip(sides / 2, 0, 1))
         half = angles.sum(axis=1, keepdims=True) / 2
         sines = np.sin(angles)
         sine_after = np.roll(sines, -1, axis=1)
         sine_before = np.roll(sines, -2, axis=1)
         cosines = 2 * np.sin(half) * np.sin(half - angles) / (sine_after * sine_before) - 1
-        signed_sines = np.sign(np.linalg.det(u))[:, None] * np.sqrt(
-            np.clip(1 - cosines**2, 0, None)
-        )
+        signed_sines = np.sign(det(u))[:, None] * np.sqrt(np.clip(1 - cosines**2, 0, None))
         numerators = (
             angles
             - np.roll(cosines, -1, axis=1) * np.roll(angles, -2, axis=1)
@@ -318,7 +317,7 @@ def distances_histogram(points, n_bins=64, reach=2.0):
     counts = np.zeros(n_bins)
     doubtful = 0
     for i in range(len(points)):
-        positions = np.linalg.norm(points[i + 1 :] - points[i], axis=1) * n_bins / reach
+        positions = norm(points[i + 1 :] - points[i], axis=1) * n_bins / reach
         for position in positions:
             counts[min(int(position), n_bins - 1)] += 1
             doubtful += abs(position - round(position)) < 1e-3
@@ -328,12 +327,12 @@ def distances_histogram(points, n_bins=64, reach=2.0):
 def interior_histogram(embedding):
     """The histogram of Rustamov 2010 by loops, and the share of pairs whose class depends on rounding."""
     embedding = np.asarray(embedding, dtype=np.float64)
-    level = np.linalg.norm(embedding, axis=1) * N_CLASSES / 1.5
+    level = norm(embedding, axis=1) * N_CLASSES / 1.5
     classes = np.minimum(level.astype(int), N_CLASSES - 1)
     rows = {pair: i for i, pair in enumerate(combinations_with_replacement(range(N_CLASSES), 2))}
     histogram = np.zeros((len(rows), N_BINS))
     for i in range(len(embedding)):
-        distances = np.linalg.norm(embedding[i + 1 :] - embedding[i], axis=1)
+        distances = norm(embedding[i + 1 :] - embedding[i], axis=1)
         positions = np.clip(distances * N_BINS / REACH - 0.5, 0, N_BINS - 1)
         for j, position in enumerate(positions, start=i + 1):
             row = rows[tuple(sorted((classes[i], classes[j])))]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from matplotlib.image import imread
+from numpy.random import default_rng
 
 from commands import run
 from igps.analysis.clusters import clusters_of
@@ -240,7 +241,7 @@ def test_outliers_lists_the_short_egg_among_the_long_first(root, tmp_path, monke
 def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(masks, tmp_path, monkeypatch):
     """The labels of a file, or the masks of a folder."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
-    random = np.random.default_rng(0)
+    random = default_rng(0)
     place = np.indices((40, 14, 14)) - 6.5
     for subject in range(10):
         labels = np.zeros((40, 14, 14), dtype=np.uint8)
@@ -297,7 +298,7 @@ def test_explain_paints_the_voxels_in_which_an_attribute_differs(tmp_path, monke
     x, y, z = np.indices((22, 18, 14)) - np.array([10.5, 8.5, 6.5]).reshape(3, 1, 1, 1)
     label = (x / 9) ** 2 + (y / 7) ** 2 + (z / 5) ** 2 < 1
     spot = ((x - 5) ** 2 + y**2 + z**2 < 9) & label
-    generator = np.random.default_rng(0)
+    generator = default_rng(0)
     for name, values in (("plain", np.zeros(label.shape)), ("bright", 1.0 * spot)):
         image = (values + 0.05 * generator.normal(size=label.shape)).astype(np.float32)
         nibabel.save(nibabel.Nifti1Image(image, affine), tmp_path / f"{name}_ct.nii.gz")
@@ -327,7 +328,7 @@ def test_explain_paints_the_voxels_in_which_an_attribute_differs(tmp_path, monke
 def test_explain_and_groups_paint_where_an_organ_differs(tmp_path, monkeypatch, capsys):
     """Organ 1 has a knob on the patient's left in one group; organ 2 does not differ."""
     nibabel = pytest.importorskip("nibabel")
-    random = np.random.default_rng(0)
+    random = default_rng(0)
     world = np.stack(np.indices((32, 20, 36)), axis=-1) * 1.5 - 24.0
     rows = [("file", "diagnosis")]
     for i in range(12):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.testing import assert_allclose
 from safetensors import safe_open
 
 from commands import error_of, run
@@ -98,7 +99,7 @@ def test_retrieve_prints_and_writes_what_python_computes(root, tmp_path, monkeyp
         assert word in printed
 
     with np.load(out / "distances.npz") as archive:
-        np.testing.assert_allclose(archive["distances"], distances, atol=1e-7)
+        assert_allclose(archive["distances"], distances, atol=1e-7)
         assert archive["names"].tolist() == list(dataset.bodies.names)
         assert archive["labels"].tolist() == ["ball"] * 3 + ["egg"] * 3
     rows = list(csv.DictReader((out / "ranking.csv").open(newline="")))
@@ -154,7 +155,7 @@ def test_retrieve_reranks_in_a_table_of_its_own(root, tmp_path, monkeypatch, cap
     )
     with np.load(tmp_path / "both" / "distances.npz") as archive:
         expected = rerank(torch.from_numpy(archive["distances"]))
-        np.testing.assert_allclose(archive["reranked"], expected, atol=1e-7)
+        assert_allclose(archive["reranked"], expected, atol=1e-7)
         labels = archive["labels"].tolist()
     assert both.pop("reranked") == pytest.approx(retrieval_scores(expected, labels).mean())
     assert both == plain
@@ -257,7 +258,7 @@ def test_only_the_eigenpairs_that_are_needed_are_computed(root, tmp_path, monkey
     n_eigenpairs, same = retrieved("of interior", "--descriptor", "shape_dna")
     assert n_eigenpairs == 64
     assert computed("of interior") == {64, 250}  # the first 64 of 250, under a key of their own
-    np.testing.assert_allclose(same, few, atol=1e-6)
+    assert_allclose(same, few, atol=1e-6)
     retrieved("explicit", "--descriptor", "shape_dna", "--signature.n_eigenpairs", "70")
     assert computed("explicit") == {70}
 
@@ -308,10 +309,10 @@ def test_extract_files_and_folder(root, tmp_path, monkeypatch):
         assert two["names"].tolist() == [str(f) for f in files]
         assert two["features"].shape == (2, 10, 64)
         found = two["features"].sum(axis=(1, 2))
-        np.testing.assert_allclose(found, 1, atol=1e-5)
+        assert_allclose(found, 1, atol=1e-5)
         assert everything["labels"].tolist() == ["ball"] * 3 + ["egg"] * 3
         expected = everything["features"][[4, 0]]
-        np.testing.assert_allclose(two["features"], expected, atol=1e-7)
+        assert_allclose(two["features"], expected, atol=1e-7)
 
 
 def test_extract_short_vectors(root, tmp_path, monkeypatch, capsys):
@@ -322,11 +323,11 @@ def test_extract_short_vectors(root, tmp_path, monkeypatch, capsys):
     with np.load(tmp_path / "long.npz") as long, np.load(tmp_path / "short.npz") as short:
         assert long["features"].shape[1] > 256 >= short["features"].shape[1]
         found = np.linalg.norm(short["features"], axis=1)
-        np.testing.assert_allclose(found, 1, atol=1e-5)
+        assert_allclose(found, 1, atol=1e-5)
         module = descriptor("pretrained")
         assert isinstance(module, EmbeddedDescriptor)
         expected = module.shorten(torch.from_numpy(long["features"])).numpy()
-        np.testing.assert_allclose(short["features"], expected, atol=1e-6)
+        assert_allclose(short["features"], expected, atol=1e-6)
     with pytest.raises(SystemExit, match="1"):
         run(
             monkeypatch,
@@ -450,7 +451,7 @@ def test_a_compared_descriptor_retrieves(root, tmp_path, monkeypatch):
     described = describe(dataset, D2(), n_workers=1)
     expected = torch.cdist(described, described, p=1) / 2
     with np.load(out / "distances.npz") as archive:
-        np.testing.assert_allclose(archive["distances"], expected, atol=1e-6)
+        assert_allclose(archive["distances"], expected, atol=1e-6)
     scores = json.loads((out / "scores.json").read_text())
     assert scores["ft"] == pytest.approx(retrieval_scores(expected, dataset.labels).mean()["ft"])
     assert scores["config"]["descriptor"] == "d2"

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 
 from commands import run
 from igps.signature.measures import POWERS
@@ -57,14 +58,14 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(root, tmp_path, monkeypat
         nibabel.load(root / f"{i}.nii.gz").get_fdata() == label for i in (1, 2) for label in (1, 2)
     ]
     volumes = [8 * mask.sum() for mask in n_voxels]
-    np.testing.assert_allclose(table["voxel_volume_mm3"], volumes)
-    np.testing.assert_allclose(table["volume_mm3"], volumes, rtol=1e-3)
-    np.testing.assert_allclose(table["spacing_z_mm"], 2)
+    assert_allclose(table["voxel_volume_mm3"], volumes)
+    assert_allclose(table["volume_mm3"], volumes, rtol=1e-3)
+    assert_allclose(table["spacing_z_mm"], 2)
     centres = [2 * np.argwhere(mask).mean(axis=0) for mask in n_voxels]
     places = table[["centroid_x_mm", "centroid_y_mm", "centroid_z_mm"]]
-    np.testing.assert_allclose(places, centres, atol=0.1)
+    assert_allclose(places, centres, atol=0.1)
     ball = (36 * np.pi) ** (1 / 3) * table["volume_mm3"] ** (2 / 3)
-    np.testing.assert_allclose(table["area_mm2"] * table["sphericity"], ball)
+    assert_allclose(table["area_mm2"] * table["sphericity"], ball)
     extract(monkeypatch, root, tmp_path / "features.npz")
     with np.load(tmp_path / "features.npz") as archive:
         vectors = archive["features"].reshape(4, -1)
@@ -119,9 +120,9 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path, monkeypatch
     wide = pd.read_csv(tmp_path / "wide.csv")
     assert wide["folder"].tolist() == [f"s{i}/segmentations" for i in range(3)]
     expected = [512, 729, 1000]
-    np.testing.assert_allclose(wide["cube.volume_mm3"], expected, rtol=1e-3)
+    assert_allclose(wide["cube.volume_mm3"], expected, rtol=1e-3)
     expected = [375, 425, np.nan]
-    np.testing.assert_allclose(wide["bar.volume_mm3"], expected, rtol=1e-3)
+    assert_allclose(wide["bar.volume_mm3"], expected, rtol=1e-3)
     assert wide["folder of labels.csv"].tolist() == [
         "a",
         "a",
@@ -135,7 +136,7 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path, monkeypatch
     one = pd.read_csv(tmp_path / "one.csv")
     found = one[["bar.volume_mm3", "cube.volume_mm3"]]
     expected = [[375, 512]]
-    np.testing.assert_allclose(found, expected, rtol=1e-3)
+    assert_allclose(found, expected, rtol=1e-3)
 
 
 def test_masks_that_are_numbered_have_a_row_each(tmp_path, monkeypatch):
@@ -152,9 +153,7 @@ def test_masks_that_are_numbered_have_a_row_each(tmp_path, monkeypatch):
     found = wide.columns.tolist()[:6]
     assert found == ["file", "class", "unit", *border, "notes"]
     assert wide["file"].tolist() == [f"{label}/{number}.nii.gz" for label, number in sides]
-    np.testing.assert_allclose(
-        wide["volume_mm3"], [49 * side for side in sides.values()], rtol=1e-3
-    )
+    assert_allclose(wide["volume_mm3"], [49 * side for side in sides.values()], rtol=1e-3)
 
 
 @pytest.mark.parametrize("options", [[], ["--wide"]])

@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.stats import binomtest
 
 import igps as library
@@ -94,11 +95,11 @@ def test_every_command_takes_the_file(root, model, tmp_path, monkeypatch, capsys
     by_model = ["--descriptor", model]
     call(monkeypatch, root, "extract", eggs, *by_model, "--out", tmp_path / "features.npz")
     with np.load(tmp_path / "features.npz") as archive:
-        np.testing.assert_allclose(archive["features"], expected, atol=1e-6)
+        assert_allclose(archive["features"], expected, atol=1e-6)
     call(monkeypatch, root, "retrieve", eggs, *by_model, "--out", tmp_path / "retrieved")
     with np.load(tmp_path / "retrieved" / "distances.npz") as archive:
         distances = found.distances(expected, expected)
-        np.testing.assert_allclose(archive["distances"], distances, atol=1e-6)
+        assert_allclose(archive["distances"], distances, atol=1e-6)
     compared = ["compare", eggs, "--descriptors", model, "interior"]
     call(monkeypatch, root, *compared, "--out", tmp_path / "compared")
     rows = json.loads((tmp_path / "compared" / "compare.json").read_text())
@@ -137,7 +138,7 @@ def test_classify_tells_what_python_computes(root, model, tmp_path, monkeypatch,
     for row, one in zip(rows, told, strict=True):
         assert row[:3] == [one["name"], one["class"] or "", one["most_like"]]
     written = np.array([row[3:] for row in rows], dtype=float)
-    np.testing.assert_allclose(written, expected.probabilities, atol=1e-6)
+    assert_allclose(written, expected.probabilities, atol=1e-6)
 
 
 def test_what_is_unlike_everything_is_said(root, model, tmp_path, monkeypatch, capsys):

@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 import trimesh
 from bodies_on_disk import write_body
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
+from trimesh.creation import icosphere
 
 from igps.data.attribute_sources import (
     attribute_source,
@@ -59,7 +62,7 @@ def write_itk(path, values):
     itk = pytest.importorskip("SimpleITK")
     made = itk.GetImageFromArray(np.ascontiguousarray(values.T))
     to_lps = np.diag([-1.0, -1.0, 1.0])
-    spacing = np.linalg.norm(AFFINE[:3, :3], axis=0)
+    spacing = norm(AFFINE[:3, :3], axis=0)
     made.SetSpacing(spacing.tolist())
     made.SetDirection((to_lps @ AFFINE[:3, :3] / spacing).ravel().tolist())
     made.SetOrigin((to_lps @ AFFINE[:3, 3]).tolist())
@@ -80,7 +83,7 @@ def test_an_image_gives_a_linear_function_wherever_it_lies(body, suffix, write):
     write(body.path.with_name(f"egg{suffix}"), image())
     source = attribute_source(f"{{stem}}{suffix}")
     found = source(body, INSIDE)
-    np.testing.assert_allclose(found, linear(INSIDE), atol=1e-5)
+    assert_allclose(found, linear(INSIDE), atol=1e-5)
 
 
 @pytest.mark.parametrize("suffix", [".dx", ".mrc"])
@@ -92,7 +95,7 @@ def test_a_grid_gives_a_linear_function(body, suffix):
     grid = grids.Grid(linear(index * delta + origin), origin=origin, delta=delta)
     grid.export(str(body.path.with_name(f"a{suffix}")))
     found = attribute_source(f"a{suffix}")(body, INSIDE)
-    np.testing.assert_allclose(found, linear(INSIDE), atol=1e-4)
+    assert_allclose(found, linear(INSIDE), atol=1e-4)
 
 
 def test_axes_of_a_map_in_another_order_are_put_right(body):
@@ -110,7 +113,7 @@ def test_axes_of_a_map_in_another_order_are_put_right(body):
         file.header.maps = 2
         file.header.nxstart, file.header.nystart, file.header.nzstart = start[[2, 0, 1]]
     found = attribute_source("a.map")(body, INSIDE)
-    np.testing.assert_allclose(found, linear(INSIDE), atol=1e-4)
+    assert_allclose(found, linear(INSIDE), atol=1e-4)
 
 
 @pytest.mark.parametrize("told", ["start", "both"])
@@ -127,7 +130,7 @@ def test_a_map_is_placed_by_its_origin_or_else_by_its_start(told, body):
         if told != "origin":
             file.header.nxstart, file.header.nystart, file.header.nzstart = start
     found = attribute_source("a.mrc")(body, INSIDE)
-    np.testing.assert_allclose(found, linear(INSIDE), atol=1e-4)
+    assert_allclose(found, linear(INSIDE), atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -220,7 +223,7 @@ def test_values_at_vertices_give_the_same_linear_function_inside(body, name, wri
     path = body.path.with_name(name.partition("#")[0])
     write(path, mesh, linear(mesh.vertices))
     values = VertexAttribute(name)(body, INSIDE)
-    np.testing.assert_allclose(values, linear(INSIDE), atol=1e-3)
+    assert_allclose(values, linear(INSIDE), atol=1e-3)
     finer = mesh.subdivide()
     write(path, finer, linear(finer.vertices))
     with pytest.raises(MeshError, match=r"has 642 values for 162 vertices"):
@@ -234,7 +237,7 @@ def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(tmp_path, he
     nibabel = pytest.importorskip("nibabel")
     made = nibabel.MGHImage(image().astype(np.float32), AFFINE)
     nibabel.save(made, tmp_path / "t1.mgz")
-    ball = trimesh.creation.icosphere(subdivisions=1)
+    ball = icosphere(subdivisions=1)
     mdc = made.header["Mdc"]  # rows are the directions of the axes of voxels
     keys = dict(zip(("xras", "yras", "zras", "cras"), [*mdc, made.header["Pxyz_c"]], strict=True))
     told = {
@@ -253,21 +256,21 @@ def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(tmp_path, he
         from_scanner = made.header.get_vox2ras_tkr() @ np.linalg.inv(made.affine)
     points = INSIDE @ from_scanner[:3, :3].T + from_scanner[:3, 3]
     found = attribute_source("t1.mgz")(BodyRef(tmp_path / "lh.pial"), points)
-    np.testing.assert_allclose(found, linear(INSIDE), atol=1e-4)
+    assert_allclose(found, linear(INSIDE), atol=1e-4)
 
 
 def test_values_at_vertices_survive_mending(tmp_path):
     """A ball with a triangle missing: the hole is closed, and a linear function stays one."""
-    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball = icosphere(subdivisions=3)
     open_ball = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
     write_ply(tmp_path / "ball.ply", open_ball, linear(open_ball.vertices))
     found = VertexAttribute("{file}#height")(BodyRef(tmp_path / "ball.ply"), INSIDE)
-    np.testing.assert_allclose(found, linear(INSIDE), atol=1e-2)
+    assert_allclose(found, linear(INSIDE), atol=1e-2)
 
 
 def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(tmp_path):
     """Two balls in one file, whose values jump between them; then values of the second ball alone."""
-    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball = icosphere(subdivisions=3)
     away = trimesh.Trimesh(ball.vertices + np.array([5, 0, 0]), ball.faces, process=False)
     both = trimesh.util.concatenate([ball, away])
     values = np.concatenate([linear(ball.vertices), linear(ball.vertices) + 100])
@@ -286,8 +289,8 @@ def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(tmp_pat
     ):
         source = VertexAttribute(f"{name}.ply#height", reading=LoadOptions(bodies="objects"))
         found = source(BodyRef(tmp_path / "two.obj", part), INSIDE + np.array([shift, 0, 0]))
-        np.testing.assert_allclose(found, linear(INSIDE) + added, atol=1e-3)
-    few = trimesh.creation.icosphere(subdivisions=1)
+        assert_allclose(found, linear(INSIDE) + added, atol=1e-3)
+    few = icosphere(subdivisions=1)
     write_ply(tmp_path / "few.ply", few, linear(few.vertices))
     with pytest.raises(
         MeshError, match=r"has 42 values for 642 vertices \(1284 in the whole file\)"
@@ -297,11 +300,11 @@ def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(tmp_pat
 
 def test_values_at_the_vertices_of_a_cavity_count(tmp_path):
     """2 on the cavity, 1 outside; in the wall, mean values by an integral over directions, weighted by 1 / distance."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    pit = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    ball = icosphere(subdivisions=4)
+    pit = icosphere(subdivisions=4, radius=0.5)
     pit.invert()
     hollow = trimesh.util.concatenate([ball, pit])
-    radii = np.linalg.norm(hollow.vertices, axis=1)
+    radii = norm(hollow.vertices, axis=1)
     hollow.vertex_attributes["heat"] = np.where(radii < 0.9, 2.0, 1.0)
     hollow.export(tmp_path / "ball.ply")
     (tmp_path / "bodies").mkdir()
@@ -328,12 +331,12 @@ def test_values_at_the_vertices_of_a_cavity_count(tmp_path):
         )
         inside = dataset[0].signature.interior
         surface = dataset[0].signature.surface
-        radii = np.linalg.norm(inside.points, axis=1)
+        radii = norm(inside.points, axis=1)
         expected = [in_wall(radius) if cavities == "keep" else 1.0 for radius in radii]
-        np.testing.assert_allclose(inside.attributes["heat"], expected, atol=0.01)
-        on_cavity = np.linalg.norm(surface.points, axis=1) < 0.9
+        assert_allclose(inside.attributes["heat"], expected, atol=0.01)
+        on_cavity = norm(surface.points, axis=1) < 0.9
         assert on_cavity.any() == (cavities == "keep")
-        np.testing.assert_allclose(surface.attributes["heat"], 1.0 + on_cavity, atol=1e-5)
+        assert_allclose(surface.attributes["heat"], 1.0 + on_cavity, atol=1e-5)
 
 
 def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog):
@@ -369,7 +372,7 @@ def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body):
     index = (INSIDE - AFFINE[:3, 3]) @ np.linalg.inv(AFFINE[:3, :3]).T
     whole = (index[:, 0] > 10) & (index[:, 2] > 8)
     expected = linear(INSIDE)[whole]
-    np.testing.assert_allclose(found[whole], expected, atol=1e-5)
+    assert_allclose(found[whole], expected, atol=1e-5)
     assert known[whole].all()
     assert np.abs(found[known]).max() < 10
 
@@ -472,7 +475,7 @@ def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(body, suffix, cont
 def test_images_among_bodies_are_no_bodies(tmp_path, is_absolute):
     for name in ("ball", "cube"):
         (tmp_path / name).mkdir()
-        trimesh.creation.icosphere(subdivisions=1).export(tmp_path / name / "x.off")
+        icosphere(subdivisions=1).export(tmp_path / name / "x.off")
         image = tmp_path / "ct" / name / "x.off.nii.gz"
         image.parent.mkdir(parents=True)
         image.touch()
@@ -526,7 +529,7 @@ def test_an_image_is_added_to_a_cached_collection_and_again_when_it_changes(tmp_
     with_image = dataset(attributes=source)
     for samples in (with_image[0].signature.interior, with_image[1].signature.surface):
         expected = linear(samples.points)
-        np.testing.assert_allclose(samples.attributes["ct"], expected, atol=1e-5)
+        assert_allclose(samples.attributes["ct"], expected, atol=1e-5)
     first = dataset(attributes=source).cached_keys()
     write_nifti(tmp_path / "bodies" / "one.nii.gz", image() + 1)
     assert dataset(attributes=source).cached_keys() == [None, first[1]]
@@ -537,7 +540,7 @@ def test_an_image_is_added_to_a_cached_collection_and_again_when_it_changes(tmp_
     assert "two.nii.gz does not exist" in failure.error
     found = changed[0].signature.interior
     expected = linear(found.points) + 1
-    np.testing.assert_allclose(found.attributes["ct"], expected, atol=1e-5)
+    assert_allclose(found.attributes["ct"], expected, atol=1e-5)
 
 
 def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path):
@@ -558,14 +561,14 @@ def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path):
         points = np.array([[5.0, 0, 0], [8.0, 0, 0]])
         charge = ResidueAttribute("charge")
         found = charge(BodyRef(path, "chain A"), points)
-        np.testing.assert_allclose(found, 1.0, atol=1e-6)
+        assert_allclose(found, 1.0, atol=1e-6)
         found = charge(BodyRef(path, "chain B"), points)
-        np.testing.assert_allclose(found, -1.0, atol=1e-6)
+        assert_allclose(found, -1.0, atol=1e-6)
         found = charge(BodyRef(path, "model"), points)
-        np.testing.assert_allclose(found, 1.0, atol=1e-6)
+        assert_allclose(found, 1.0, atol=1e-6)
         above = points + np.array([0, 0, 30])
         found = charge(BodyRef(path), above)
-        np.testing.assert_allclose(found, -1.0, atol=1e-6)
+        assert_allclose(found, -1.0, atol=1e-6)
     write_body(tmp_path / "egg.off", 1, 1)
     with pytest.raises(
         MeshError, match=r"egg\.off: expected a PDB, mmCIF or PQR file for 'charge'"
@@ -584,7 +587,7 @@ def test_an_image_that_has_changed_is_read_again_though_its_time_is_the_same(nam
         itk.WriteImage(itk.GetImageFromArray(np.full((9, 9, 9), value)), str(tmp_path / name))
         os.utime(tmp_path / name, (1e9, 1e9))
         found = attribute_source(name)(BodyRef(tmp_path / "egg.off"), np.array([[-2.0, -3.0, 4.0]]))
-        np.testing.assert_allclose(found, value)
+        assert_allclose(found, value)
 
 
 def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(tmp_path):
@@ -596,7 +599,7 @@ def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(t
         )
         os.utime(body.path, (1e9, 1e9))
         found = ResidueAttribute("charge")(body, np.zeros((1, 3)))
-        np.testing.assert_allclose(found, charge)
+        assert_allclose(found, charge)
 
 
 def test_what_is_known_of_amino_acids_alone_is_refused_of_nucleotides_in_these_words(tmp_path):
@@ -625,7 +628,7 @@ def test_names_of_blocks_do_not_tell_what_a_body_is(tmp_path):
         for number, charge in ((1, 1.0), (2, -1.0)):
             body = BodyRef(tmp_path / "two.cif", f"{name} model {number}")
             found = ResidueAttribute("charge")(body, np.zeros((1, 3)))
-            np.testing.assert_allclose(found, charge)
+            assert_allclose(found, charge)
 
 
 def stem_and_height(body, points):
@@ -648,9 +651,9 @@ def test_a_function_of_body_and_points_gives_an_attribute(tmp_path):
     for item, n_letters in zip(dataset, (1, 3), strict=True):
         samples = item.signature.interior
         expected = n_letters + samples.points[:, 2]
-        np.testing.assert_allclose(samples.attributes["named"], expected, atol=1e-5)
+        assert_allclose(samples.attributes["named"], expected, atol=1e-5)
         doubled = 2 * samples.points[:, 0]
-        np.testing.assert_allclose(samples.attributes["x"], doubled, atol=1e-5)
+        assert_allclose(samples.attributes["x"], doubled, atol=1e-5)
 
 
 @pytest.mark.parametrize("takes_body", [True, False])
@@ -704,4 +707,4 @@ def test_a_body_of_all_models_has_the_residues_of_all(tmp_path):
     points = np.array([[0.0, 0, 0], [60, 0, 0], [1, 0, 0]])
     charges = ResidueAttribute("charge")(BodyRef(tmp_path / "two.pdb"), points)
     expected = [1, -1, 1]
-    np.testing.assert_allclose(charges, expected, atol=1e-6)
+    assert_allclose(charges, expected, atol=1e-6)

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.testing import assert_array_equal
+from torch.testing import assert_close
 from torch.utils.data import DataLoader, Dataset
 
 from batches import two_bodies
@@ -54,15 +56,15 @@ def test_bodies_are_the_signatures_without_padding(signatures):
         assert body.area == signature.area
         assert body.volume == signature.volume
         assert body.eigenvalues.dtype == np.float64
-        np.testing.assert_array_equal(body.eigenvalues, signature.eigenvalues)
+        assert_array_equal(body.eigenvalues, signature.eigenvalues)
         for room in ("interior", "surface"):
             found = getattr(body, room)
             expected = getattr(signature, room)
             np.testing.assert_allclose(found.points, centred(signature, room), atol=1e-6)
-            np.testing.assert_array_equal(found.eigenfunctions, expected.eigenfunctions)
+            assert_array_equal(found.eigenfunctions, expected.eigenfunctions)
             assert found.attributes.keys() == expected.attributes.keys()
             for name, values in expected.attributes.items():
-                np.testing.assert_array_equal(found.attributes[name], values)
+                assert_array_equal(found.attributes[name], values)
 
 
 def test_padding_is_marked(signatures):
@@ -84,10 +86,10 @@ def test_collate_pads_without_changing_any_description(signatures):
         together = histogram(batch)
         alone = torch.cat([histogram(collate([signature])) for signature in signatures])
         assert together.shape == (3, 10, 64)
-        torch.testing.assert_close(together, alone, atol=1e-7, rtol=0)
+        assert_close(together, alone, atol=1e-7, rtol=0)
         found = together.sum(dim=(1, 2))
         expected = torch.ones(3)
-        torch.testing.assert_close(found, expected)
+        assert_close(found, expected)
 
 
 def test_labels_and_names(signatures):
@@ -126,9 +128,7 @@ def test_points_are_centred_before_they_lose_digits():
     far = replace(near, points=near.points + 1e6)
     whole = Signature(np.array([1.0, 2.0]), near, near, 1.0, 1.0, SignatureConfig(n_eigenpairs=2))
     batch = collate([whole, replace(whole, interior=far, surface=far)])
-    torch.testing.assert_close(
-        batch.interior.points[0], batch.interior.points[1], atol=1e-6, rtol=0
-    )
+    assert_close(batch.interior.points[0], batch.interior.points[1], atol=1e-6, rtol=0)
     found = batch.interior.points.mean(dim=1)
     np.testing.assert_allclose(found, 0, atol=1e-6)
 
@@ -222,7 +222,7 @@ def test_one_shape_of_a_batch_is_a_body(signatures):
     batch = collate(signatures)
     numbers = (0, -1, np.int64(1), torch.tensor(2), np.array(0))
     assert [batch[i].id for i in numbers] == ["body 0", "body 2", "body 1", "body 2", "body 0"]
-    np.testing.assert_array_equal(batch[2].eigenvalues, signatures[2].eigenvalues)
+    assert_array_equal(batch[2].eigenvalues, signatures[2].eigenvalues)
     found = [body.id for body in batch.bodies()]
     assert found == list(batch.ids)
     with pytest.raises(IndexError):
@@ -358,9 +358,7 @@ def test_batches_go_to_a_device_and_bodies_come_back(signatures):
     assert batch.interior.attributes["depth"].is_cuda
     assert batch.labels.is_cuda
     for body, signature in zip(batch.bodies(), signatures, strict=True):
-        np.testing.assert_array_equal(
-            body.interior.eigenfunctions, signature.interior.eigenfunctions
-        )
+        assert_array_equal(body.interior.eigenfunctions, signature.interior.eigenfunctions)
 
 
 def test_a_batch_tells_in_a_line_what_it_is_and_does_not_unpack_to_two_bodies():

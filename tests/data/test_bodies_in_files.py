@@ -7,6 +7,7 @@ import nibabel
 import numpy as np
 import pytest
 import trimesh
+from trimesh.creation import icosphere
 
 import igps.data.pipeline as pipeline_module
 from igps.data.dataset import SignatureDataset
@@ -24,7 +25,7 @@ PARTS = {"liver": (1.0, 1.2, 1.5), "spleen": (1.0, 1.0, 2.0)}
 
 
 def egg(part, subject):
-    body = trimesh.creation.icosphere(subdivisions=2)
+    body = icosphere(subdivisions=2)
     body.vertices *= np.array(PARTS[part]) * subject
     return body
 
@@ -236,7 +237,7 @@ def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path):
     (tmp_path / "deep.gltf").write_text("[" * 200_000)
     (tmp_path / "list.gltf").write_text('{"buffers": 7}')
     (tmp_path / "out.gltf").write_text('{"buffers": [{"uri": "../../x.bin"}]}')
-    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball = icosphere(subdivisions=3)
     ball.export(tmp_path / "ball.off")
     for _ in range(2):
         dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
@@ -290,7 +291,7 @@ def test_what_is_read_beside_a_file_counts(tmp_path, trust_recent_files):
     assert volumes("nifti", str(tmp_path / "two.csv"))["x.nii.gz#liver"] == 1152
 
     (tmp_path / "gltf").mkdir()
-    scene = trimesh.Scene(trimesh.creation.icosphere(subdivisions=2, radius=9))
+    scene = trimesh.Scene(icosphere(subdivisions=2, radius=9))
     for name, content in scene.export(file_type="gltf").items():
         path = tmp_path / "gltf" / name.replace("buffer", "a buffer")
         path.write_bytes(content.replace(b"gltf_buffer", b"gltf_a%20buffer"))
@@ -340,7 +341,7 @@ def test_where_a_job_of_several_bodies_is_lost_each_is_tried_alone(root, tmp_pat
 
 
 def test_a_name_that_is_too_long_for_a_file_costs_no_other(tmp_path):
-    trimesh.creation.icosphere(2).export(tmp_path / "a.off")
+    icosphere(2).export(tmp_path / "a.off")
     (tmp_path / "labels.csv").write_text(f"file,label\na.off,one\n{'x' * 300}.off,one\n")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     (failure,) = dataset.precompute(n_workers=1)

@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
@@ -46,13 +47,13 @@ def test_round_trip_is_exact(tmp_path, signature):
     assert restored.config == signature.config
     for name in ("area", "volume", "name", "notes", "residual"):
         assert getattr(restored, name) == getattr(signature, name)
-    np.testing.assert_array_equal(restored.eigenvalues, signature.eigenvalues)
+    assert_array_equal(restored.eigenvalues, signature.eigenvalues)
     for room in ("interior", "surface"):
         before = getattr(signature, room)
         after = getattr(restored, room)
-        np.testing.assert_array_equal(after.points, before.points)
-        np.testing.assert_array_equal(after.eigenfunctions, before.eigenfunctions)
-        np.testing.assert_array_equal(after.attributes["depth"], before.attributes["depth"])
+        assert_array_equal(after.points, before.points)
+        assert_array_equal(after.eigenfunctions, before.eigenfunctions)
+        assert_array_equal(after.attributes["depth"], before.attributes["depth"])
 
 
 def truncate(path):

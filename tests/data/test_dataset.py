@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from bodies_on_disk import write_body
+from numpy.testing import assert_allclose, assert_array_equal
 from torch.utils.data import DataLoader
 
 import igps
@@ -92,7 +93,7 @@ def test_functions_of_position_become_attributes(root, tmp_path):
         for samples in (part[1].signature.interior, part[1].signature.surface):
             height = samples.attributes["height"]
             expected = samples.points[:, 2]
-            np.testing.assert_allclose(height, expected, rtol=1e-6)
+            assert_allclose(height, expected, rtol=1e-6)
     found = SignatureDataset(root, CONFIG, tmp_path / "cache")[0].signature.interior.attributes
     assert found == {}
     wrong = {"height": lambda points: points[:-1]}
@@ -125,7 +126,7 @@ def test_computed_once_then_read(dataset, counted):
     first = dataset[0].signature
     second = dataset[0].signature
     assert len(counted) == 1
-    np.testing.assert_array_equal(first.interior.eigenfunctions, second.interior.eigenfunctions)
+    assert_array_equal(first.interior.eigenfunctions, second.interior.eigenfunctions)
 
 
 def test_key_covers_every_parameter(root, tmp_path):
@@ -180,7 +181,7 @@ def test_truncated_file_is_reported_and_computed_again(dataset, counted, caplog,
         after = dataset[0].signature
     assert str(file) in caplog.text
     assert len(counted) == 2
-    np.testing.assert_array_equal(after.interior.eigenfunctions, before.interior.eigenfunctions)
+    assert_array_equal(after.interior.eigenfunctions, before.interior.eigenfunctions)
 
 
 @pytest.mark.parametrize("how", ["processes", "threads"])
@@ -254,7 +255,7 @@ def test_batch_has_the_meshes_on_demand(dataset):
     assert batch.ids == ("egg/2.off", "ball/2.off")
     assert batch.labels.tolist() == [1, 0]
     for mesh, body, i in zip(batch.meshes or (), batch.bodies(), (3, 1), strict=True):
-        np.testing.assert_array_equal(mesh.vertices, dataset.mesh(i).vertices)
+        assert_array_equal(mesh.vertices, dataset.mesh(i).vertices)
         assert mesh.area == pytest.approx(body.area)
 
 
@@ -337,7 +338,7 @@ def test_after_precompute_the_meshes_are_not_needed(dataset, root, counted):
     for part in (dataset, pickle.loads(pickle.dumps(dataset)), dataset.subset(range(4))):
         for item, expected in zip(part, before, strict=True):
             functions = item.signature.interior.eigenfunctions
-            np.testing.assert_array_equal(functions, expected.interior.eigenfunctions)
+            assert_array_equal(functions, expected.interior.eigenfunctions)
         assert part.cached_keys() == keys
         assert part.all_notes() == notes
     assert counted == []
@@ -474,7 +475,7 @@ def test_an_attribute_is_added_to_cached_signatures_without_new_eigenpairs(
         for i, item in enumerate(one):
             for samples in (item.signature.interior, item.signature.surface):
                 expected = 2 * samples.points[:, 2] + (100 if i > 1 else 0)
-                np.testing.assert_allclose(samples.attributes["ct"], expected, rtol=1e-6)
+                assert_allclose(samples.attributes["ct"], expected, rtol=1e-6)
         assert again or one.cached_keys() != dataset.cached_keys()
     assert counted == []
     # Another image, and several channels, are other values; what was there stays.
@@ -505,7 +506,7 @@ def test_a_pre_transform_changes_a_copy_of_a_file_alike_whichever_comes_first(tm
     assert [Path(one.name).name for one in found] == ["a.off", "b.off", "b.off", "a.off"]
     for one in found[1:]:
         expected = found[0].interior.points
-        np.testing.assert_array_equal(one.interior.points, expected)
+        assert_array_equal(one.interior.points, expected)
 
 
 def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(root, tmp_path):
@@ -523,9 +524,7 @@ def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(root, tmp_p
         dataset.precompute(n_workers=1, progress=False)
         samples = dataset[1].signature.interior
         assert len(samples) == 6
-        np.testing.assert_allclose(
-            samples.attributes["ct"], slope * samples.points[:, 2], rtol=1e-6
-        )
+        assert_allclose(samples.attributes["ct"], slope * samples.points[:, 2], rtol=1e-6)
     assert changed(2.0).cached_keys() != changed(3.0).cached_keys()
     with pytest.raises(ValueError, match="pre_transform: expected attributes with a cache_tag"):
         SignatureDataset(

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import igps
@@ -110,7 +111,7 @@ def test_descriptions_are_finite_numbers_of_one_shape_and_repeat(name):
     assert torch.isfinite(other).all()
     with torch.inference_mode():
         again = pickle.loads(pickle.dumps(descriptor(name)))(body("rod"))
-    torch.testing.assert_close(again, first, rtol=0, atol=0)
+    assert_close(again, first, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -127,7 +128,7 @@ def test_padding_changes_no_description(name):
     for row, kind in zip(together, ("rod", "other"), strict=True):
         scale = float(description(name, kind).abs().max())
         expected = description(name, kind)
-        torch.testing.assert_close(row[None], expected, rtol=1e-4, atol=1e-5 * scale)
+        assert_close(row[None], expected, rtol=1e-4, atol=1e-5 * scale)
 
 
 def with_individuals(name):
@@ -160,7 +161,7 @@ def test_tensors_are_made_on_the_device_of_the_bodies(name, compiled, request):
         with torch.device("meta"):
             described = found(body("rod"))
             distances = found.distances(described, expected)
-    torch.testing.assert_close(described, expected, rtol=0, atol=0)
+    assert_close(described, expected, rtol=0, atol=0)
     assert not distances.is_meta
 
 
@@ -201,9 +202,7 @@ def test_a_batch_on_a_device_is_described_at_once(name, monkeypatch):
             together = found(several)
         counts.append(counting.found)
     assert counts[0] == counts[1]
-    torch.testing.assert_close(
-        together, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max())
-    )
+    assert_close(together, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
 
 
 @pytest.mark.parametrize("name", ON_TENSORS)
@@ -214,7 +213,7 @@ def test_any_number_of_bodies_goes_through_an_exported_program(name):
     with torch.no_grad():
         program = exported(found, SignatureBatch.concatenate([rod, other]))
         for batch in (several, other):
-            torch.testing.assert_close(program(*tensors(batch)), found(batch), rtol=0, atol=1e-6)
+            assert_close(program(*tensors(batch)), found(batch), rtol=0, atol=1e-6)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -228,10 +227,8 @@ def test_cuda_describes_as_the_cpu_does(name):
         described = torch.cat([found(body(kind).to("cuda")) for kind in ("rod", "other")])
         found_distances = found.distances(described, described)
     scale = float(expected.abs().max())
-    torch.testing.assert_close(described.cpu(), expected, rtol=1e-4, atol=1e-5 * scale)
-    torch.testing.assert_close(
-        found_distances.cpu(), distances, rtol=1e-3, atol=1e-4 * float(distances.max())
-    )
+    assert_close(described.cpu(), expected, rtol=1e-4, atol=1e-5 * scale)
+    assert_close(found_distances.cpu(), distances, rtol=1e-3, atol=1e-4 * float(distances.max()))
 
 
 @pytest.mark.parametrize("name", ["gps", "rich+", "pretrained+"])
@@ -241,7 +238,7 @@ def test_descriptors_are_traced_whole(name):
     with torch.inference_mode():
         expected = found(body("rod"))
         traced = torch.compile(found, backend="eager", fullgraph=True)(body("rod"))
-    torch.testing.assert_close(traced, expected, rtol=1e-4, atol=1e-5)
+    assert_close(traced, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", NAMES)

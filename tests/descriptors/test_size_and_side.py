@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.linalg import det, norm, qr
+from torch.testing import assert_close
 
 import igps
 from igps import Mesh, SignatureConfig, collate, compute_signature
@@ -88,7 +90,7 @@ def test_short_vectors_keep_the_numbers_of_size_and_side(signatures):
     assert short.shape[1] == 256 + 55
     found = short[:, -55:]
     expected = vectors[:, -55:]
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     with pytest.raises(ValueError, match="shorten: expected a descriptor of vectors"):
         igps.descriptor("rich+size").shorten(vectors)
 
@@ -114,12 +116,12 @@ def test_a_body_that_is_turned_is_far_nearer_than_its_mirror_image():
     random = np.random.default_rng(3)
     ball = SURFACE.vertices
     middles = random.normal(size=(12, 3))
-    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    middles /= norm(middles, axis=1, keepdims=True)
     squares = ((ball[:, None] - middles) ** 2).sum(axis=2)
     heights = np.exp(-squares / random.uniform(0.1, 0.5, 12)) @ random.uniform(-0.3, 0.7, 12)
     body = ball * (1 + heights)[:, None] * [1, 1.3, 0.8]
-    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
-    turn *= np.linalg.det(turn)
+    turn = qr(random.normal(size=(3, 3)))[0]
+    turn *= det(turn)
     # Turned outwards again
     meshes = [Mesh(body @ one, SURFACE.faces) for one in (np.eye(3), turn, -np.eye(3), -turn)]
     descriptor = igps.descriptor("interior+side")
@@ -142,13 +144,13 @@ def bent(mirrored=False, turn=None):
 
 
 def test_signed_volumes_turn_their_signs_with_a_mirror_image_and_are_blind_to_motion_scale_and_padding():
-    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    turn *= np.linalg.det(turn)
+    turn = qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turn *= det(turn)
     meshes = (bent(), bent(True), bent(turn=turn), twisted(0.0))
     made = [compute_signature(one, CONFIG) for one in meshes]
     found = signed_volumes(collate(made))
     alone = torch.cat([signed_volumes(collate([one])) for one in made])
-    torch.testing.assert_close(found, alone, atol=1e-6, rtol=0)
+    assert_close(found, alone, atol=1e-6, rtol=0)
     assert float((found[0] + found[1]).norm()) < 0.1 * float(found[0].norm())
     assert float((found[0] - found[2]).norm()) < 0.1 * float(found[0].norm())
     # Its three planes of symmetry leave it nothing but where samples lie
@@ -164,11 +166,11 @@ def test_a_signed_volume_is_that_of_its_three_vectors():
     )
     decay = np.exp(-0.01 * signature.area * signature.eigenvalues[:16])
     heat = np.square(signature.surface.eigenfunctions[:, :16].astype(float)) @ decay
-    by_distance = np.linalg.norm(inside, axis=1) @ inside / len(inside)
-    of_surface = np.linalg.norm(outside, axis=1) @ outside / len(outside)
+    by_distance = norm(inside, axis=1) @ inside / len(inside)
+    of_surface = norm(outside, axis=1) @ outside / len(outside)
     by_heat = heat / heat.mean() @ outside / len(outside)
     three = np.stack([by_distance, of_surface, by_heat])
-    expected = np.linalg.det(three) / np.linalg.norm(three, axis=1).prod() ** (2 / 3)
+    expected = det(three) / norm(three, axis=1).prod() ** (2 / 3)
     assert abs(expected) > 1e-4
     found = float(signed_volumes(collate([signature]))[0, 0])
     assert found == pytest.approx(expected, rel=1e-3)
@@ -339,9 +341,9 @@ def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_
     again = igps.descriptor(f"{tmp_path}/mine.safetensors+size", mirror="distinct")
     assert again.name == loaded.name
     described = loaded(batch)
-    torch.testing.assert_close(described, model(batch))
+    assert_close(described, model(batch))
     expected = model.distances(described, described)
-    torch.testing.assert_close(loaded.distances(described, described), expected)
+    assert_close(loaded.distances(described, described), expected)
 
 
 @pytest.mark.parametrize(
@@ -392,5 +394,5 @@ def test_coordinates_keep_size_beside_those_of_the_descriptor(signatures):
     rows = sized.coordinates(descriptions)
     form = igps.descriptor("interior")(collate([signatures["body"]])).flatten()
     found = rows[0, :-2]
-    torch.testing.assert_close(found, form.sqrt())
+    assert_close(found, form.sqrt())
     assert rows[:, -2:].equal(descriptions[:, -2:])

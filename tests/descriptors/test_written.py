@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
+from numpy.testing import assert_allclose
+from trimesh.creation import icosphere
 
 import igps
 from igps.data.dataset import SignatureDataset
@@ -61,7 +62,7 @@ def write(folder, text):
 @pytest.fixture
 def bodies(tmp_path):
     for i, stretch in enumerate(((1, 1, 1.7), (1, 1.3, 2.2), (1, 1, 1))):
-        ball = trimesh.creation.icosphere(subdivisions=3)
+        ball = icosphere(subdivisions=3)
         ball.vertices *= stretch
         ball.export(tmp_path / f"{i}.off")
     needs = igps.descriptor("interior").requirements | igps.descriptor("pretrained").requirements
@@ -129,7 +130,7 @@ def test_what_is_no_descriptor_is_told_with_what_there_is(tmp_path, text, senten
 
 def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tmp_path):
     for i in range(2):
-        trimesh.creation.icosphere(subdivisions=2, radius=1 + i).export(tmp_path / f"{i}.off")
+        icosphere(subdivisions=2, radius=1 + i).export(tmp_path / f"{i}.off")
     text = "parts: [{eigenpairs: 20, axes: [height: {quantiles: 4, soft: true}, interior_distance: {n_bins: 8}]}]"
     own = igps.descriptor(write(tmp_path, text))
     heights = {"height": lambda points: points[:, 2]}
@@ -145,7 +146,7 @@ def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tm
     heights_of = [one.interior.attributes["height"][:500] for one in dataset.signatures()]
     expected = np.quantile(np.concatenate(heights_of), [0.125, 0.375, 0.625, 0.875])
     centres = own.histograms[0].axes[0].centres()
-    np.testing.assert_allclose(centres, expected, rtol=1e-5)
+    assert_allclose(centres, expected, rtol=1e-5)
     described = describe(dataset, own)
     assert not fit_centres(own, dataset[[0]])
     own.save(tmp_path / "kept.safetensors")
@@ -183,7 +184,7 @@ def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp
     for kind in ("graded", "layered", "mottled", "core"):
         for i in range(4):
             files.append(tmp_path / "root" / kind / f"{i}.off")
-            body = trimesh.creation.icosphere(subdivisions=3)
+            body = icosphere(subdivisions=3)
             body.vertices *= np.array([1, 0.8, 1.3]) * generator.uniform(0.98, 1.02, 3)
             (tmp_path / "root" / kind).mkdir(parents=True, exist_ok=True)
             body.export(files[-1])
@@ -220,19 +221,19 @@ def test_an_attribute_adds_its_histograms_with_its_weight(bodies, tmp_path):
     form = describe(dataset, descriptor("pretrained"))
     inside = describe(dataset, whole.inside)
     found = inside.sum(dim=1)
-    np.testing.assert_allclose(found, 1, rtol=1e-5)
+    assert_allclose(found, 1, rtol=1e-5)
     by_bins = inside.reshape(3, 36, 32)  # pairs of eight classes
     levels = [by_bins, by_bins.reshape(3, 36, 8, 4).sum(dim=3), by_bins.sum(dim=2)]
     told = sum(chi_square(level.flatten(1), level.flatten(1)) for level in levels) / 3
     expected = descriptor("pretrained").distances(form, form) + 0.5 * 0.083 / 0.017 * told
     found = whole.distances(described, described)
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert_allclose(found, expected, atol=1e-5)
     rows = whole.coordinates(described, within_class=True)
     kept = descriptor("pretrained").coordinates(form, within_class=True)
     found = rows[:, : kept.shape[1]]
-    np.testing.assert_allclose(found, kept, atol=1e-6)
+    assert_allclose(found, kept, atol=1e-6)
     squares = rows[:, kept.shape[1] :].square()
-    np.testing.assert_allclose(squares, 0.5 * 0.083 / 0.017 * inside.flatten(1), atol=1e-5)
+    assert_allclose(squares, 0.5 * 0.083 / 0.017 * inside.flatten(1), atol=1e-5)
     assert igps.descriptor("pretrained+height=0.5+size").name == "pretrained+height=0.5+size"
     with pytest.raises(ValueError, match="with: expected positive weights"):
         igps.descriptor("interior+height=0")

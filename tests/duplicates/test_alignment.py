@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -32,7 +34,7 @@ def ellipsoid(axes, n=1500, seed=0):
     """Samples of an ellipsoid, denser where it is pointed."""
     directions = even_directions(n, seed)
     normals = directions / axes
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= norm(normals, axis=1, keepdims=True)
     return SurfaceSamples.of(directions * axes, normals, 1.0)
 
 
@@ -46,7 +48,7 @@ def bumpy(amplitude, n=2000, seed=0):
     # ∇(|x| − a·P₄(z/|x|)) = u − a·P₄′·(e_z − z·u)/r
     upward = np.eye(3)[2] - z[:, None] * directions
     normals = directions - amplitude * (slope / radius)[:, None] * upward
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= norm(normals, axis=1, keepdims=True)
     return SurfaceSamples.of(radius[:, None] * directions, normals, 4 * np.pi)
 
 
@@ -67,7 +69,7 @@ def test_a_motion_a_mirror_and_a_scale_leave_nothing(seed, mirror, scale):
     normals = np.concatenate([one.normals, other.normals])
     body = SurfaceSamples.of(points, normals, 1.0)
     again = moved(body, seed, mirror, scale)
-    np.testing.assert_allclose(again.extents, body.extents, rtol=1e-9)
+    assert_allclose(again.extents, body.extents, rtol=1e-9)
     assert surface_distance(body, again) < 1e-5
 
 
@@ -91,7 +93,7 @@ def rough(amplitude, n, seed):
     wave = 0.02
     directions = even_directions(n, seed)
     smooth = directions / axes
-    steepness = np.linalg.norm(smooth, axis=1, keepdims=True)
+    steepness = norm(smooth, axis=1, keepdims=True)
     phase = 2 * np.pi * (directions * axes)[:, :1] / wave
     points = directions * axes + amplitude * np.cos(phase) * smooth / steepness
     return points, smooth / steepness
@@ -134,11 +136,11 @@ def test_nearest_points_of_a_surface():
     anywhere = np.random.default_rng(0).uniform(-1, 1, (40, 3))
     expected, _, _ = trimesh.proximity.closest_point_naive(body, anywhere)
     found, _ = surface.nearest(SurfaceSamples(anywhere, anywhere))
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert_allclose(found, expected, atol=1e-12)
     above = body.triangles_center + 0.01 * body.face_normals
     points, normals = surface.nearest(SurfaceSamples(above, body.face_normals))
-    np.testing.assert_allclose(points, body.triangles_center, atol=1e-12)
-    np.testing.assert_allclose(normals, body.face_normals, atol=1e-9)
+    assert_allclose(points, body.triangles_center, atol=1e-12)
+    assert_allclose(normals, body.face_normals, atol=1e-9)
 
 
 def test_in_place_nothing_is_moved():

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from trimesh.creation import annulus
 
 from commands import run
 from igps.cli.commands import COMMANDS
@@ -257,8 +258,8 @@ def test_handles_tell_bodies_apart_however_near_they_are(tmp_path):
 def test_washers_with_other_holes_are_no_copies(tmp_path):
     """Washers of 128 vertices with holes 0.5 and 1 % larger: coarseness must not excuse displaced vertices."""
     for name, hole in (("one", 0.5), ("half", 0.5025), ("whole", 0.505)):
-        trimesh.creation.annulus(hole, 1.0, 0.3, sections=32).export(tmp_path / f"{name}.off")
-    mirrored = trimesh.creation.annulus(0.5, 1.0, 0.3, sections=32)
+        annulus(hole, 1.0, 0.3, sections=32).export(tmp_path / f"{name}.off")
+    mirrored = annulus(0.5, 1.0, 0.3, sections=32)
     turn = trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9]))
     mirrored.apply_transform(turn)
     mirrored.apply_scale([-2, 2, 2])
@@ -286,9 +287,7 @@ def test_a_mirror_image_is_called_so(tmp_path):
 
 def test_a_small_hole_that_is_a_little_larger_is_another_surface(tmp_path):
     """The hole is larger by 0.5 %; the largest distance is the difference of the radii over √area."""
-    one, larger = (
-        trimesh.creation.annulus(hole, 1.0, 0.3, sections=64) for hole in (0.05, 0.05025)
-    )
+    one, larger = (annulus(hole, 1.0, 0.3, sections=64) for hole in (0.05, 0.05025))
     for name, body in (("one", one), ("copy", one.subdivide()), ("larger", larger.subdivide())):
         body.export(tmp_path / f"{name}.off")
     surfaces = Surfaces(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"))

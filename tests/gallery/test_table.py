@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 pytest.importorskip("lancedb", reason="the extra [index]")
 
@@ -86,7 +87,7 @@ def test_few_are_compared_one_by_one(tmp_path, searched_by):
     for i in range(5):
         found = table.nearest(rows[i : i + 1], chi_square, top=7)
         assert numbers(found) == expected.indices[i].tolist()
-        torch.testing.assert_close(found[1], expected.distances[i], rtol=1e-6, atol=1e-7)
+        assert_close(found[1], expected.distances[i], rtol=1e-6, atol=1e-7)
         assert torch.equal(found[2], rows[expected.indices[i]])
     assert {name: found[0][0][name] for name in told(4)} == told(4)
     assert len(table) == 90
@@ -102,7 +103,7 @@ def test_the_nearest_of_many_are_those_of_all(tmp_path):
         found = table.nearest(asked[i : i + 1], chi_square, top=10, exact=True)
         assert numbers(found) == exact.indices[i].tolist()
         expected = exact.distances[i]
-        torch.testing.assert_close(found[1], expected, rtol=1e-5, atol=1e-6)
+        assert_close(found[1], expected, rtol=1e-5, atol=1e-6)
 
 
 def test_a_condition_keeps_what_numpy_keeps(tmp_path):
@@ -150,10 +151,10 @@ def test_long_descriptions_are_kept_in_half_precision(tmp_path):
     table = written(tmp_path / "g.igps", rows, "chi_square")
     assert str(table.table.schema.field("vector").type) == "fixed_size_list<item: halffloat>[1501]"
     kept = torch.cat([table.decoded(some)[0] for some in table.batches()])
-    torch.testing.assert_close(kept, rows, rtol=2**-11, atol=1e-11)
+    assert_close(kept, rows, rtol=2**-11, atol=1e-11)
     found = table.nearest(rows[:1], chi_square, top=5)
     expected = search(rows[:1], rows, top=5).distances[0]
-    torch.testing.assert_close(found[1], expected, rtol=2e-3, atol=1e-6)
+    assert_close(found[1], expected, rtol=2e-3, atol=1e-6)
 
 
 def test_rows_are_added_replaced_and_removed(tmp_path):

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import default_rng
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
@@ -42,22 +43,22 @@ class Damage:
 
 def holes(mesh, seed=0):
     """Remove a share of the area, in round patches of equal size around random places."""
-    return _with_holes(mesh.vertices, mesh.faces, np.random.default_rng(seed))
+    return _with_holes(mesh.vertices, mesh.faces, default_rng(seed))
 
 
 def soup(mesh, seed=0):
     """Give each triangle separate corners, in single precision and in random order, as in an STL file."""
-    return _as_soup(mesh.vertices, mesh.faces, np.random.default_rng(seed))
+    return _as_soup(mesh.vertices, mesh.faces, default_rng(seed))
 
 
 def turned(mesh, seed=0):
     """Turn a random share of the faces inside out."""
-    return mesh.vertices.copy(), _with_turned(mesh.faces, np.random.default_rng(seed))
+    return mesh.vertices.copy(), _with_turned(mesh.faces, default_rng(seed))
 
 
 def fins(mesh, seed=0):
     """Add triangles that stand on edges, as high as a hundredth of the diagonal, and double a share of the faces."""
-    return _with_fins(mesh.vertices, mesh.faces, np.random.default_rng(seed))
+    return _with_fins(mesh.vertices, mesh.faces, default_rng(seed))
 
 
 def parts(mesh, seed=0):
@@ -65,7 +66,7 @@ def parts(mesh, seed=0):
 
     The speck is a ball with a thousandth of the area, at 0.6 diagonals from the centre of the bounding box.
     """
-    return _with_parts(mesh.vertices, mesh.faces, np.random.default_rng(seed), mesh)
+    return _with_parts(mesh.vertices, mesh.faces, default_rng(seed), mesh)
 
 
 def halves(mesh, seed=0):
@@ -101,7 +102,7 @@ def noise(mesh, seed=0):
 
 def everything(mesh, seed=0):
     """Apply all of the above; a MeshError if manifold3d does not accept the mesh."""
-    generator = np.random.default_rng(seed)
+    generator = default_rng(seed)
     vertices, faces = halves(disturbances.noise(mesh, _NOISE, seed))
     vertices, faces = _with_holes(vertices, faces, generator)
     vertices, faces = _with_fins(vertices, faces, generator)

@@ -6,6 +6,7 @@ import nibabel
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 from tests.fields.cad.step_files import write_step
 
 from igps.mesh.errors import MeshError
@@ -57,7 +58,7 @@ def test_six_copies_on_a_plate_are_six_bodies_in_its_unit(tmp_path):
     for i, body in enumerate(bodies):
         found = body.vertices.min(axis=0)
         expected = [3 * i, 0, 0]
-        np.testing.assert_allclose(found, expected)
+        assert_allclose(found, expected)
         assert body.volume == pytest.approx(1 / 6)
         assert body.unit == "in"
     assert len(load_bodies(path, PIECES)) == 6
@@ -80,10 +81,10 @@ def test_an_object_of_objects_is_one_body_turned_and_mirrored_as_the_plan_says(t
     assert raw.unit == "mm"
     corners = raw.vertices[raw.faces]
     volumes = np.linalg.det(corners - [10, 20, 30]).reshape(2, 4).sum(axis=1) / 6
-    np.testing.assert_allclose(volumes, [1 / 6, 1 / 3])
+    assert_allclose(volumes, [1 / 6, 1 / 3])
     # A quarter turn about z takes x to y: the second reaches from 20 back to 18.
     found = [corners[4:, :, 1].min(), corners[4:, :, 1].max()]
-    np.testing.assert_allclose(found, [18, 20])
+    assert_allclose(found, [18, 20])
 
 
 def test_objects_that_are_made_of_themselves_or_of_thousands_are_refused(tmp_path):
@@ -146,7 +147,7 @@ def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path):
     bodies = load_bodies(tmp_path / "boxes.ply", PIECES)
     found = [body.volume for body in bodies]
     expected = [1, 27, 8]
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert_allclose(found, expected, rtol=1e-6)
     for body in bodies:
         assert "left out 1 speck" in body.notes
     # Used by no face

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import ndimage
 
 from igps import (
@@ -51,8 +53,8 @@ def test_a_cavity_that_is_turned_inwards_is_part_of_the_body_as_it_is():
 @pytest.mark.parametrize("inwards", [False, True])
 def test_filled_it_is_the_ball(inwards):
     full = mend(*joined(ball(1), ball(0.5, inwards=inwards)))
-    np.testing.assert_array_equal(full.vertices, BALL.vertices)
-    np.testing.assert_array_equal(full.faces, BALL.faces)
+    assert_array_equal(full.vertices, BALL.vertices)
+    assert_array_equal(full.faces, BALL.faces)
 
 
 def test_a_hidden_part_that_is_turned_outwards_is_turned_for_a_cavity_and_kept_once():
@@ -96,13 +98,13 @@ def test_what_is_no_cavity_is_refused(other):
 
 def test_samples_lie_in_the_wall_and_on_all_surfaces():
     hollow = Mesh(*joined(ball(1), ball(0.7, inwards=True)), cavities=True)
-    radii = np.linalg.norm(interior_samples(hollow, 32, 1000), axis=1)
+    radii = norm(interior_samples(hollow, 32, 1000), axis=1)
     assert radii.min() > 0.69
     assert radii.max() < 1
     signature = compute_signature(
         hollow, SignatureConfig(n_eigenpairs=30, attributes=("surface_direction", "depth"))
     )
-    on_cavity = np.linalg.norm(signature.surface.points, axis=1) < 0.85
+    on_cavity = norm(signature.surface.points, axis=1) < 0.85
     assert on_cavity.mean() == pytest.approx(0.49 / 1.49, abs=0.01)
     # Normals of the body point into its cavity, and its depth is that of the wall.
     radial = (signature.surface.attributes["surface_direction"] * signature.surface.points).sum(
@@ -121,11 +123,11 @@ def test_eigenfunctions_of_the_outside_go_on_through_the_wall():
         Mesh(*joined(ball(1), ball(0.7, inwards=True)), cavities=True), config
     )
     full = compute_signature(Mesh(*ball(1)), config)
-    np.testing.assert_allclose(hollow.eigenvalues, full.eigenvalues, rtol=1e-6)
+    assert_allclose(hollow.eigenvalues, full.eigenvalues, rtol=1e-6)
     for samples in (hollow.interior, hollow.surface):
         squares = np.square(samples.eigenfunctions[:, :3]).sum(axis=1) * 4 * np.pi / 3
         expected = np.square(samples.points).sum(axis=1)
-        np.testing.assert_allclose(squares, expected, rtol=0.03)
+        assert_allclose(squares, expected, rtol=0.03)
 
 
 def test_the_outer_surface_has_vertices_enough_whatever_the_cavity_has():
@@ -153,7 +155,7 @@ def test_a_file_is_read_with_its_cavities_where_they_are_kept(tmp_path):
 
 
 def test_a_label_keeps_its_cavities():
-    radius = np.linalg.norm(np.indices((40, 40, 40)) - 19.5, axis=0)
+    radius = norm(np.indices((40, 40, 40)) - 19.5, axis=0)
     mask = (radius < 16) & (radius > 7)
     mask[19, 19, 4] = False  # a voxel of noise is no cavity
     vertices, faces, notes = voxel_surface(mask, cavities=True)
@@ -171,7 +173,7 @@ def test_a_label_keeps_its_cavities():
 def test_a_cavity_behind_a_wall_with_gaps_is_noted():
     """As of a wall thinner than a voxel. A closed wall, and a cup, get no note."""
     offset = np.indices((40, 40, 40)) - 19.7
-    radius = np.linalg.norm(offset, axis=0)
+    radius = norm(offset, axis=0)
     thin = np.abs(radius - 14) < 0.45
     closed = np.abs(radius - 14) < 0.75
     assert ndimage.label(np.pad(~thin, 1, constant_values=True))[1] == 1  # the cavity is open
@@ -212,12 +214,12 @@ def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path):
         assert kept.volume == pytest.approx(1.5 * np.count_nonzero(labels == int(part)), rel=1e-3)
         assert filled.genus == (part == "3")
         of = ball if part == "1" else kept
-        np.testing.assert_array_equal(filled.vertices, of.vertices)
-        np.testing.assert_array_equal(filled.faces, of.faces)
+        assert_array_equal(filled.vertices, of.vertices)
+        assert_array_equal(filled.faces, of.faces)
     wall = load_mesh(tmp_path / "x.nii", LoadOptions(cavities="keep"), part="1")
     assert wall.area == pytest.approx(4 * np.pi * (15**2 + 8**2), rel=0.03)
     signature = compute_signature(wall, SignatureConfig(n_eigenpairs=30))
-    from_middle = np.linalg.norm(signature.interior.points - [28, 28, 20.25], axis=1)
+    from_middle = norm(signature.interior.points - [28, 28, 20.25], axis=1)
     assert from_middle.min() > 7
     assert from_middle.max() < 16
     assert signature.volume == pytest.approx(wall.volume)
@@ -225,7 +227,7 @@ def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path):
 
 def test_a_piece_of_a_label_in_its_cavity_is_told():
     """A seed in its shell was left out without a word."""
-    radius = np.linalg.norm(np.indices((41, 41, 41)) - 20.0, axis=0)
+    radius = norm(np.indices((41, 41, 41)) - 20.0, axis=0)
     shell = (radius > 14) & (radius < 18)
     seed = radius < 8
     vertices, faces, notes = voxel_surface(shell | seed, cavities=True)

@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_array_equal
 from training.disturbances import noise
+from trimesh.creation import icosphere
 
 from igps.mesh.denoising import Neighbours, is_noisy, noise_and_edge, remove_noise
 from igps.mesh.mending import mend, repair_steps
@@ -14,7 +18,7 @@ from igps.shapes import ArticulatedShapes
 
 def bumpy():
     """A sphere with 2,562 vertices and bumps of about six edge lengths."""
-    surface = trimesh.creation.icosphere(subdivisions=4)
+    surface = icosphere(subdivisions=4)
     x, y, z = surface.vertices.T
     bumps = 0.03 * np.sin(12 * x) * np.sin(11 * y + 1) * np.cos(10 * z)
     return Mesh(np.asarray(surface.vertices) * (1 + bumps)[:, None], np.asarray(surface.faces))
@@ -28,12 +32,12 @@ def test_noise_is_found_and_shape_is_not(sphere):
 
 def test_rounding_creases_and_odd_triangles_are_no_noise():
     box = trimesh.creation.box((1, 2, 3)).subdivide_to_size(0.1)
-    generator = np.random.default_rng(0)
+    generator = default_rng(0)
     flat = np.asarray(box.vertices) + generator.normal(0, 1e-7, box.vertices.shape)
     assert not is_noisy(flat, np.asarray(box.faces))
-    surface = trimesh.creation.icosphere(subdivisions=4)
+    surface = icosphere(subdivisions=4)
     shifted = np.asarray(surface.vertices) + generator.normal(0, 0.01, surface.vertices.shape)
-    shifted /= np.linalg.norm(shifted, axis=1, keepdims=True)
+    shifted /= norm(shifted, axis=1, keepdims=True)
     assert not is_noisy(shifted, np.asarray(surface.faces))
 
 
@@ -49,19 +53,19 @@ def test_area_and_volume_come_back(sphere):
     smooth = Mesh(remove_noise(noisy.vertices, noisy.faces), noisy.faces)
     assert smooth.area == pytest.approx(sphere.area, rel=0.01)
     assert smooth.volume == pytest.approx(sphere.volume, rel=0.01)
-    before = np.linalg.norm(noisy.vertices, axis=1)
-    after = np.abs(np.linalg.norm(smooth.vertices, axis=1) - 1)
+    before = norm(noisy.vertices, axis=1)
+    after = np.abs(norm(smooth.vertices, axis=1) - 1)
     assert after.std() < 0.6 * before.std()
 
 
 @pytest.mark.parametrize("ratio", [0.1, 0.3])
 def test_passes_follow_the_noise(ratio):
     """The area, volume and normals of the clean ball come back from noise of several strengths."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
+    ball = icosphere(subdivisions=4)
     vertices = np.asarray(ball.vertices)
     faces = np.asarray(ball.faces)
     noise_length = ratio * np.sqrt((ball.edges_unique_length**2).mean())
-    lengths = np.random.default_rng(0).normal(0, noise_length, len(vertices))
+    lengths = default_rng(0).normal(0, noise_length, len(vertices))
     noisy = vertices * (1 + lengths)[:, None]
     # The noise makes the edges longer.
     assert _noise_over_edge(noisy, faces) == pytest.approx(
@@ -80,7 +84,7 @@ def test_passes_follow_the_noise(ratio):
 @pytest.mark.parametrize(("steps", "sections"), [(3, 256), (5, 200)])
 def test_turned_parts_of_thin_triangles_come_back(steps, sections):
     """Rims of many corners, far apart: noise as wide as a triangle crumples them. The clean part is the oracle."""
-    random = np.random.default_rng(steps)
+    random = default_rng(steps)
     ends = np.cumsum(random.uniform(0.2, 1, steps))
     radii = random.uniform(0.15, 0.5, steps)
     corners = [(r, z) for k, r in enumerate(radii) for z in (ends[k - 1] if k else 0, ends[k])]
@@ -94,8 +98,8 @@ def test_turned_parts_of_thin_triangles_come_back(steps, sections):
     assert abs(smooth.area - part.area) < 0.25 * (rough.area - part.area)
     assert smooth.volume == pytest.approx(part.volume, rel=0.01)
     # Steps between rims stay sharp: no corner has moved farther than the noise moved it.
-    moved = np.linalg.norm(smooth.vertices - part.vertices, axis=1)
-    by_noise = np.linalg.norm(rough.vertices - part.vertices, axis=1)
+    moved = norm(smooth.vertices - part.vertices, axis=1)
+    by_noise = norm(rough.vertices - part.vertices, axis=1)
     assert np.quantile(moved, 0.95) < np.quantile(by_noise, 0.95)
 
 
@@ -119,7 +123,7 @@ def plate_with_holes(seed, longest_edge=None):
     """Long thin triangles between the rims; with shorter edges, slivers."""
     import manifold3d
 
-    random = np.random.default_rng(seed)
+    random = default_rng(seed)
     plate = manifold3d.Manifold.cube((2, 1, 0.2), True)
     for x in (-0.6, 0, 0.6):
         hole = manifold3d.Manifold.cylinder(1, random.uniform(0.1, 0.25), -1, 256, True)
@@ -146,7 +150,7 @@ def test_a_fan_of_thousands_of_slivers_does_not_fold_up():
     """Noise is wider than they are, and all meet in one vertex."""
     import manifold3d
 
-    ball = trimesh.creation.icosphere(subdivisions=5)
+    ball = icosphere(subdivisions=5)
     whole = manifold3d.Manifold(
         manifold3d.Mesh64(np.array(ball.vertices), np.array(ball.faces, dtype=np.uint64))
     )
@@ -198,7 +202,7 @@ def _noise_over_edge(vertices, faces):
 
 
 def _unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / norm(vectors, axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("index", [0, 7])
@@ -207,14 +211,14 @@ def test_coarse_bodies_are_told_apart_from_noisy_ones(index):
     body = ArticulatedShapes(index + 1, 1, seed=2, n_vertices=1500)[index]
     mesh = Mesh(body.vertices, body.faces)
     assert not is_noisy(mesh.vertices, mesh.faces)
-    edge = np.linalg.norm(np.diff(mesh.vertices[mesh.faces], axis=1), axis=2).mean()
+    edge = norm(np.diff(mesh.vertices[mesh.faces], axis=1), axis=2).mean()
     assert is_noisy(noise(mesh, 0.18 * edge / mesh.diagonal, 0).vertices, mesh.faces)
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.005, True), (0.05, False)])
 def test_what_is_full_of_holes_is_no_surface_to_look_over(sphere, share, expected):
     rough = noise(sphere, 0.004, 0)
-    faces = rough.faces[np.random.default_rng(0).random(len(rough.faces)) >= share]
+    faces = rough.faces[default_rng(0).random(len(rough.faces)) >= share]
     assert is_noisy(rough.vertices, faces) is expected
 
 
@@ -225,7 +229,7 @@ def test_boundaries_stay(sphere):
     sides = np.sort(np.stack([faces, np.roll(faces, 1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     edges, count = np.unique(sides, axis=0, return_counts=True)
     rim = np.unique(edges[count == 1])
-    np.testing.assert_array_equal(smooth[rim], noisy[rim])
+    assert_array_equal(smooth[rim], noisy[rim])
     assert not np.array_equal(smooth, noisy)
 
 
@@ -233,6 +237,6 @@ def test_mending_smooths_noise_only(sphere):
     noisy = noise(sphere, 0.004, 1)
     mesh = mend(noisy.vertices, noisy.faces)
     assert repair_steps(mesh.notes) == ("smoothed",)
-    np.testing.assert_array_equal(mesh.faces, sphere.faces)
+    assert_array_equal(mesh.faces, sphere.faces)
     expected = remove_noise(noisy.vertices, noisy.faces)
-    np.testing.assert_array_equal(mesh.vertices, expected)
+    assert_array_equal(mesh.vertices, expected)

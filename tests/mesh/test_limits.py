@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-import trimesh
+from trimesh.creation import icosphere
 
 from igps.mesh import limits
 from igps.mesh.errors import MeshError
@@ -16,14 +16,14 @@ from igps.signature.voxels import interior_samples
 
 @pytest.mark.parametrize("kind", ["off", "ply", "stl"])
 def test_announced_numbers(tmp_path, kind):
-    surface = trimesh.creation.icosphere(subdivisions=4)
+    surface = icosphere(subdivisions=4)
     surface.export(tmp_path / f"ball.{kind}")
     assert expected_faces(tmp_path / f"ball.{kind}") == len(surface.faces)
 
 
 @pytest.mark.parametrize("name", ["ball.obj", "ball_ascii.stl"])
 def test_numbers_from_the_size(tmp_path, name):
-    surface = trimesh.creation.icosphere(subdivisions=5)
+    surface = icosphere(subdivisions=5)
     kind = "stl_ascii" if "ascii" in name else None
     surface.export(tmp_path / name, file_type=kind)
     assert 0.5 < expected_faces(tmp_path / name) / len(surface.faces) < 3
@@ -126,7 +126,7 @@ def test_the_limits_of_the_process_bound_its_memory():
 
 
 def test_a_grid_that_does_not_fit_is_refused(monkeypatch):
-    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball = icosphere(subdivisions=2)
     mesh = Mesh(ball.vertices, ball.faces, name="ball")
     free = 100 * 2**20
     monkeypatch.setattr(limits, "available_memory", lambda: free)

@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 import trimesh
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
+from trimesh.creation import icosphere
 
 from conftest import FACES, TETRAHEDRON
 from igps.fields.meshes import vertex_values
@@ -44,11 +47,11 @@ def test_an_empty_file_is_called_empty(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "glb"])
 def test_formats_keep_vertices_in_order(tmp_path, suffix):
-    surface = trimesh.creation.icosphere(subdivisions=1)
+    surface = icosphere(subdivisions=1)
     surface.export(tmp_path / f"mesh.{suffix}")
     mesh = load_mesh(tmp_path / f"mesh.{suffix}")
-    np.testing.assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
-    np.testing.assert_array_equal(mesh.faces, surface.faces)
+    assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
+    assert_array_equal(mesh.faces, surface.faces)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +59,7 @@ def test_formats_keep_vertices_in_order(tmp_path, suffix):
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "shift_jis"])
 def test_comments_may_be_in_any_encoding(tmp_path, suffix, comment, encoding):
-    surface = trimesh.creation.icosphere(subdivisions=1)
+    surface = icosphere(subdivisions=1)
     options = {"encoding": "ascii"} if suffix == "ply" else {}
     text = surface.export(file_type=suffix, **options)
     lines = (text if isinstance(text, str) else text.decode()).split("\n")
@@ -65,8 +68,8 @@ def test_comments_may_be_in_any_encoding(tmp_path, suffix, comment, encoding):
     path = tmp_path / f"mesh.{suffix}"
     path.write_bytes("\n".join(lines).encode(encoding))
     mesh = load_mesh(path)
-    np.testing.assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
-    np.testing.assert_array_equal(mesh.faces, surface.faces)
+    assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
+    assert_array_equal(mesh.faces, surface.faces)
     (tmp_path / "cloud.xyz").write_bytes(f"# {words}\n0 0 1\n0 1 0\n".encode(encoding))
     cloud = read_surface(tmp_path / "cloud.xyz")
     expected = [[0, 0, 1], [0, 1, 0]]
@@ -75,13 +78,13 @@ def test_comments_may_be_in_any_encoding(tmp_path, suffix, comment, encoding):
 
 def test_a_byte_order_mark_costs_no_vertex(tmp_path):
     """Editors on Windows put it first, before the first vertex where no comment stands above."""
-    surface = trimesh.creation.icosphere(subdivisions=1)
+    surface = icosphere(subdivisions=1)
     lines = surface.export(file_type="obj").split("\n")
     text = "\n".join(line for line in lines if not line.startswith("#"))
     (tmp_path / "mesh.obj").write_text(text, encoding="utf-8-sig")
     assert (tmp_path / "mesh.obj").read_bytes()[3:5] == b"v "
     mesh = load_mesh(tmp_path / "mesh.obj")
-    np.testing.assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
+    assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
 
 
 def test_quads_become_triangles(tmp_path):
@@ -98,7 +101,7 @@ def test_quads_become_triangles(tmp_path):
 @pytest.mark.parametrize("start", [0, 3])
 def test_polygons_with_corners_turned_inwards_do_not_fold(start, tmp_path):
     """Prisms over stars, whose area and volume are those of the polygon (Gauss's formula)."""
-    random = np.random.default_rng(start)
+    random = default_rng(start)
     angle = np.linspace(0, 2 * np.pi, 30, endpoint=False)
     if start == 3:
         angle = np.sort(random.uniform(0, 2 * np.pi, 4))
@@ -136,7 +139,7 @@ def test_a_polygon_around_a_hole_does_not_fold(tmp_path):
 @pytest.mark.parametrize("n_corners", [60, 5000])
 def test_a_polygon_that_crosses_itself_or_has_many_corners_is_cut_all_the_same(n_corners, tmp_path):
     """Into triangles that use every corner, each side of the polygon once."""
-    places = np.random.default_rng(0).normal(size=(n_corners, 2)).tolist()
+    places = default_rng(0).normal(size=(n_corners, 2)).tolist()
     face = " ".join(str(i + 1) for i in range(n_corners))
     (tmp_path / "scribble.obj").write_text(
         "\n".join(f"v {x!r} {y!r} 0" for x, y in places) + f"\nf {face}\n"
@@ -165,10 +168,10 @@ def by_trimesh(text, path):
 
 def test_off_files_are_read_as_trimesh_reads_them(tmp_path):
     """These are plain, or have faults and liberties of all kinds."""
-    ball = trimesh.creation.icosphere(subdivisions=0)
+    ball = icosphere(subdivisions=0)
     plain = ball.export(file_type="off")
     lines = plain.splitlines()
-    random = np.random.default_rng(0)
+    random = default_rng(0)
     texts = [
         plain,
         plain.replace("\n", "\r\n"),
@@ -214,8 +217,8 @@ def test_off_files_are_read_as_trimesh_reads_them(tmp_path):
             found = None
         assert (found is None) == (expected is None), text
         if expected is not None:
-            np.testing.assert_array_equal(found.vertices, expected.vertices)
-            np.testing.assert_array_equal(found.faces, expected.faces.reshape(-1, 3))
+            assert_array_equal(found.vertices, expected.vertices)
+            assert_array_equal(found.faces, expected.faces.reshape(-1, 3))
         outcomes.append(expected is not None)
     assert 150 < sum(outcomes) < len(texts) - 150
 
@@ -224,17 +227,17 @@ def test_texture_seams_do_not_split_vertices(tmp_path):
     lines = [f"v {x} {y} {z}" for x, y, z in TETRAHEDRON] + ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
     lines += [f"f {a + 1}/{i % 4 + 1} {b + 1}/2 {c + 1}/3" for i, (a, b, c) in enumerate(FACES)]
     (tmp_path / "seams.obj").write_text("\n".join(lines) + "\n")
-    np.testing.assert_allclose(load_mesh(tmp_path / "seams.obj").vertices, TETRAHEDRON)
+    assert_allclose(load_mesh(tmp_path / "seams.obj").vertices, TETRAHEDRON)
     head = f"ply\nformat ascii 1.0\nelement vertex {len(TETRAHEDRON)}\n"
     head += "".join(f"property float {name}\n" for name in ("x", "y", "z", "height"))
     head += f"element face {len(FACES)}\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
     rows = [f"{x} {y} {z} {z}" for x, y, z in TETRAHEDRON]
     rows += [f"3 {a} {b} {c} 6 0.{i} 0 1 0.{i} 0.{i} 1" for i, (a, b, c) in enumerate(FACES)]
     (tmp_path / "seams.ply").write_text(head + "end_header\n" + "\n".join(rows) + "\n")
-    np.testing.assert_allclose(
+    assert_allclose(
         load_mesh(tmp_path / "seams.ply", LoadOptions(mend="never")).vertices, TETRAHEDRON
     )
-    np.testing.assert_allclose(
+    assert_allclose(
         vertex_values.read(tmp_path / "seams.ply")["height"], np.array(TETRAHEDRON)[:, 2]
     )
 
@@ -242,9 +245,9 @@ def test_texture_seams_do_not_split_vertices(tmp_path):
 @pytest.mark.parametrize("away", [0.0, 1e-9])
 def test_loose_triangles_need_and_get_welding(tmp_path, away):
     """Corners that are in one place, or nearly so; of an STL file the former are one vertex already."""
-    surface = trimesh.creation.icosphere(subdivisions=2)
+    surface = icosphere(subdivisions=2)
     loose = np.asarray(surface.vertices)[surface.faces].reshape(-1, 3)
-    loose = loose + np.random.default_rng(0).uniform(-away, away, loose.shape)
+    loose = loose + default_rng(0).uniform(-away, away, loose.shape)
     path = write_off(tmp_path / "mesh.off", loose, np.arange(len(loose)).reshape(-1, 3))
     with pytest.raises(MeshError, match="boundary edges"):
         load_mesh(path, LoadOptions("never"))
@@ -256,7 +259,7 @@ def test_loose_triangles_need_and_get_welding(tmp_path, away):
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_each_fault_is_mended_at_any_scale(tmp_path, scale):
-    surface = trimesh.creation.icosphere(subdivisions=2)
+    surface = icosphere(subdivisions=2)
     vertices = np.asarray(surface.vertices)
     faces = np.asarray(surface.faces)
     faulty = faces.copy()
@@ -274,7 +277,7 @@ def test_each_fault_is_mended_at_any_scale(tmp_path, scale):
 
 
 def test_pieces_that_are_no_body_together_are_bodies_each(tmp_path):
-    fine = trimesh.creation.icosphere(subdivisions=3)
+    fine = icosphere(subdivisions=3)
     large = trimesh.creation.box((5, 5, 5))
     vertices = np.vstack([fine.vertices + 20, large.vertices])
     faces = np.vstack([fine.faces, large.faces + len(fine.vertices)])
@@ -301,7 +304,7 @@ def test_unknown_way_to_mend_is_refused():
 
 @pytest.mark.parametrize(("suffix", "normals"), [("xyz", False), ("ply", True)])
 def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(tmp_path, suffix, normals):
-    surface = trimesh.creation.icosphere(subdivisions=4)
+    surface = icosphere(subdivisions=4)
     rows = np.asarray(surface.vertices) * [1, 0.8, 1.3]
     names = ["x", "y", "z"]
     if normals:
@@ -327,12 +330,12 @@ def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(tmp_path, suffix, 
 
 
 def test_a_body_is_left_as_it_is_bit_for_bit(tmp_path):
-    surface = trimesh.creation.icosphere(subdivisions=3)
+    surface = icosphere(subdivisions=3)
     path = write_off(tmp_path / "body.off", surface.vertices, surface.faces)
     mended = load_mesh(path)
     untouched = load_mesh(path, LoadOptions("never"))
-    np.testing.assert_array_equal(mended.vertices, untouched.vertices)
-    np.testing.assert_array_equal(mended.faces, untouched.faces)
+    assert_array_equal(mended.vertices, untouched.vertices)
+    assert_array_equal(mended.faces, untouched.faces)
     assert mended.notes == ()
 
 
@@ -359,7 +362,7 @@ def test_a_format_without_its_module_says_which_extra_has_it(tmp_path, monkeypat
 @pytest.mark.parametrize("where", ["far", "far in double precision", "at the origin"])
 def test_places_that_single_precision_rounds_off_are_told(where, tmp_path):
     """In coordinates of maps an object of some metres has steps of half a metre, which bend its surface."""
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
+    ball = icosphere(subdivisions=3, radius=10.0)
     vertices = ball.vertices + (0.0 if where == "at the origin" else np.array([5e5, 5.4e6, 0.0]))
     if where == "far in double precision":
         text = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())

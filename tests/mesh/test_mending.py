@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_array_equal
 from scipy.spatial import cKDTree
 from tests.mesh.damages import DAMAGES, halves, holes
+from trimesh.creation import icosphere
 
 from igps.mesh.errors import MeshError
 from igps.mesh.mending import mend, repair_steps
@@ -20,7 +24,7 @@ def box():
 
 
 def area(vertices, faces):
-    return float(np.linalg.norm(area_vectors(vertices, faces), axis=1).sum())
+    return float(norm(area_vectors(vertices, faces), axis=1).sum())
 
 
 def same_surface(a, b):
@@ -41,8 +45,8 @@ def same_surface(a, b):
 
 def test_a_body_is_left_as_it_is(blob):
     mesh = mend(blob.vertices, blob.faces)
-    np.testing.assert_array_equal(mesh.vertices, blob.vertices)
-    np.testing.assert_array_equal(mesh.faces, blob.faces)
+    assert_array_equal(mesh.vertices, blob.vertices)
+    assert_array_equal(mesh.faces, blob.faces)
     assert mesh.notes == ()
     assert repair_steps(mesh.notes) == ()
 
@@ -59,17 +63,17 @@ def test_holes_are_filled_where_the_surface_was(sphere):
     assert repair_steps(mesh.notes) == ("filled",)
     assert mesh.notes == ("filled 3 small holes",)
     # The old vertices stay, and the new ones go on like the sphere.
-    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.01
+    assert np.abs(norm(mesh.vertices, axis=1) - 1).max() < 0.01
     assert mesh.volume == pytest.approx(sphere.volume, rel=2e-3)
     sides = mesh.vertices[mesh.faces]
-    length = np.linalg.norm(sides - np.roll(sides, 1, axis=1), axis=2)
+    length = norm(sides - np.roll(sides, 1, axis=1), axis=2)
     assert length.max() < 3 * np.median(length)
 
 
 def test_holes_that_touch_are_filled_one_by_one(sphere):
     """Rims that meet in a vertex are taken apart."""
     kept = np.ones(len(sphere.faces), dtype=bool)
-    kept[np.random.default_rng(0).choice(len(kept), len(kept) // 20, replace=False)] = False
+    kept[default_rng(0).choice(len(kept), len(kept) // 20, replace=False)] = False
     mesh = mend(sphere.vertices, sphere.faces[kept])
     assert repair_steps(mesh.notes) == ("filled",)
     assert mesh.volume == pytest.approx(sphere.volume, rel=2e-3)
@@ -77,7 +81,7 @@ def test_holes_that_touch_are_filled_one_by_one(sphere):
 
 def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere):
     """Those of a disc of radius r = n / 2π steps that are one step apart: about π r² = n² / 4π."""
-    away = np.linalg.norm(sphere.vertices - sphere.vertices[0], axis=1)
+    away = norm(sphere.vertices - sphere.vertices[0], axis=1)
     kept = sphere.faces[(away[sphere.faces] > 0.11 * np.ptp(sphere.vertices)).all(axis=1)]
     sides = np.sort(kept[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, counts = np.unique(sides, axis=0, return_counts=True)
@@ -97,7 +101,7 @@ def test_halves_that_overlap_are_the_body_again(blob):
 
 
 def test_a_cup_is_not_filled():
-    surface = trimesh.creation.icosphere(subdivisions=3)
+    surface = icosphere(subdivisions=3)
     open_faces = np.asarray(surface.faces)[surface.triangles_center[:, 2] < 0.2]
     mesh = mend(np.asarray(surface.vertices), open_faces)
     # The cap's vertices were left unused.
@@ -106,8 +110,8 @@ def test_a_cup_is_not_filled():
 
 
 def test_a_part_that_sticks_out_is_not_hidden():
-    surface = trimesh.creation.icosphere(subdivisions=3)
-    knob = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+    surface = icosphere(subdivisions=3)
+    knob = icosphere(subdivisions=2, radius=0.3)
     knob.apply_translation([1, 0, 0])
     whole = trimesh.util.concatenate([surface, knob])
     mesh = mend(np.asarray(whole.vertices), np.asarray(whole.faces))
@@ -125,7 +129,7 @@ def test_too_few_vertices_are_more_on_the_same_surface():
     assert mesh.area == pytest.approx(22, rel=1e-12)
     # All on the surface of the box.
     assert np.isclose(np.abs(mesh.vertices), [0.5, 1, 1.5]).any(axis=1).all()
-    np.testing.assert_array_equal(mesh.vertices[:8], box().vertices)
+    assert_array_equal(mesh.vertices[:8], box().vertices)
 
 
 @pytest.mark.parametrize("n_vertices", [9, 333])
@@ -133,10 +137,10 @@ def test_longest_edges_are_cut_first(n_vertices):
     mesh = subdivide(box(), n_vertices)
     assert len(mesh.vertices) == n_vertices
     sides = mesh.vertices[mesh.faces]
-    length = np.linalg.norm(sides - np.roll(sides, 1, axis=1), axis=2)
+    length = norm(sides - np.roll(sides, 1, axis=1), axis=2)
     if n_vertices > 50:
         assert length.max() < 4.5 * np.sqrt(22 / n_vertices)
-    assert (np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1) > 1e-6).all()
+    assert (norm(area_vectors(mesh.vertices, mesh.faces), axis=1) > 1e-6).all()
 
 
 def test_never_refuses_and_always_makes_watertight(blob):
@@ -153,8 +157,8 @@ def test_never_refuses_and_always_makes_watertight(blob):
 def test_always_leaves_the_boundary_of_one_body_as_it_is(blob):
     mesh = mend(blob.vertices, blob.faces, how="always")
     assert mesh.notes == ()
-    np.testing.assert_array_equal(mesh.vertices, blob.vertices)
-    np.testing.assert_array_equal(mesh.faces, blob.faces)
+    assert_array_equal(mesh.vertices, blob.vertices)
+    assert_array_equal(mesh.faces, blob.faces)
 
 
 def test_close_turns_of_a_coil_stay_apart():
@@ -173,7 +177,7 @@ def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertig
     assert mend(crossing.vertices, crossing.faces).notes == ()
     mesh = mend(crossing.vertices, crossing.faces, how="always")
     assert repair_steps(mesh.notes) == ("watertight",)
-    points = np.random.default_rng(0).uniform(
+    points = default_rng(0).uniform(
         mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), (100_000, 3)
     )
     turn = np.linspace(0, 2.2, 3000)
@@ -196,7 +200,7 @@ def coil(turns, pitch, radius=0.2):
     middles = np.hstack([np.cos(angle), np.sin(angle), pitch * turn])
     along = np.hstack([-np.sin(angle), np.cos(angle), np.full_like(turn, pitch / (2 * np.pi))])
     outward = np.hstack([np.cos(angle), np.sin(angle), np.zeros_like(turn)])
-    upward = np.cross(outward, along / np.linalg.norm(along, axis=1, keepdims=True))
+    upward = np.cross(outward, along / norm(along, axis=1, keepdims=True))
     phase = 2 * np.pi * np.arange(around) / around
     rings = np.cos(phase)[:, None] * outward[:, None] + np.sin(phase)[:, None] * upward[:, None]
     vertices = np.vstack([(middles[:, None] + radius * rings).reshape(-1, 3), middles[[0, -1]]])
@@ -232,7 +236,7 @@ def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob):
 
 @pytest.mark.parametrize("share", [0.02, 0.5])
 def test_corners_that_differ_in_the_last_digit_of_single_precision_are_one(blob, share):
-    generator = np.random.default_rng(0)
+    generator = default_rng(0)
     corners = blob.vertices[blob.faces].reshape(-1, 3).astype(np.float32)
     moved = np.nextafter(corners, generator.choice(np.float32([-9, 9]), corners.shape))
     corners = np.where(generator.random(corners.shape) < share, moved, corners)
@@ -251,7 +255,7 @@ UNUSABLE = {
     ),
     "point": (lambda: (np.ones((4, 3)), np.array([[0, 1, 2], [1, 2, 3]])), "in one point"),
     "five": (
-        lambda: (np.random.default_rng(0).random((5, 3)), None),
+        lambda: (default_rng(0).random((5, 3)), None),
         "expected at least 10 points for a surface, got 5",
     ),
     "line of points": (
@@ -267,7 +271,7 @@ UNUSABLE = {
         "from 1e-30 to 1e\\+30",
     ),
     "tiny cloud": (
-        lambda: (1e-200 * np.random.default_rng(0).random((400, 3)), None),
+        lambda: (1e-200 * default_rng(0).random((400, 3)), None),
         "from 1e-30 to 1e\\+30",
     ),
     "nan": (lambda: (np.full((4, 3), np.nan), np.array([[0, 1, 2], [1, 2, 3]])), "NaN"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from docs.benchmarks.weld import weld_gap
+from numpy.testing import assert_array_equal
 
 from conftest import FACES, TETRAHEDRON, horseshoe, surface_genus
 from igps.mesh.errors import MeshError
@@ -101,9 +102,9 @@ def test_numbered_by_faces_is_the_same_surface_whatever_the_numbers(blob):
     found = blob.numbered_by_faces()
     again = Mesh(blob.vertices[order], rank[blob.faces]).numbered_by_faces()
     expected = blob.vertices[blob.faces]
-    np.testing.assert_array_equal(found.vertices[found.faces], expected)
-    np.testing.assert_array_equal(found.vertices, again.vertices)
-    np.testing.assert_array_equal(found.faces, again.faces)
+    assert_array_equal(found.vertices[found.faces], expected)
+    assert_array_equal(found.vertices, again.vertices)
+    assert_array_equal(found.faces, again.faces)
     assert found.numbered_by_faces().faces.tolist() == found.faces.tolist()
 
 
@@ -120,8 +121,8 @@ def test_more_notes_and_a_unit_leave_the_surface_as_it_is(blob):
 def test_a_trimesh_becomes_a_mesh_and_a_mesh_stays_itself():
     box = trimesh.creation.box((1, 2, 3))
     mesh = as_mesh(box)
-    np.testing.assert_array_equal(mesh.vertices, box.vertices)
-    np.testing.assert_array_equal(mesh.faces, box.faces)
+    assert_array_equal(mesh.vertices, box.vertices)
+    assert_array_equal(mesh.faces, box.faces)
     assert mesh.name == "mesh"
     assert as_mesh(mesh) is mesh
     box.metadata["file_name"] = "box.ply"
@@ -154,7 +155,7 @@ def test_meshes_of_other_libraries(blob):
     ):
         mesh = as_mesh(thing)
         np.testing.assert_allclose(mesh.vertices, blob.vertices, atol=1e-6)
-        np.testing.assert_array_equal(mesh.faces, blob.faces)
+        assert_array_equal(mesh.faces, blob.faces)
         assert mesh.name == "mesh"
         assert mesh.unit == unit
     quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]]

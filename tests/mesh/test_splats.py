@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
 
 from igps.mesh.watertight import splats
 
 
 def sphere(n):
     points = np.random.default_rng(0).normal(size=(n, 3))
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
+    return points / norm(points, axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("with_normals", [True, False])
@@ -22,7 +23,7 @@ def test_each_point_has_a_hexagon_across_the_surface(with_normals):
     rims = vertices.reshape(-1, 6, 3)
     assert rims.mean(axis=1) == pytest.approx(points, abs=1e-12)
     tilt = np.abs(np.einsum("nki,ni->nk", rims - points[:, None], points)).max(axis=1)
-    size = np.linalg.norm(rims[:, 0] - points, axis=1)
+    size = norm(rims[:, 0] - points, axis=1)
     assert np.quantile(tilt / size, 0.9) < (1e-12 if with_normals else 0.2)
     hexagons = trimesh.Trimesh(vertices, faces, process=False).area_faces.reshape(-1, 4).sum(axis=1)
     assert hexagons == pytest.approx(1.5 * 3**0.5 * size**2)
@@ -37,5 +38,5 @@ def test_only_large_clouds_are_thinned(monkeypatch):
     thinned = splats(points, points, 32, "cloud")[0].reshape(-1, 6, 3).mean(axis=1)
     assert len(thinned) < 1000
     # What is left is of the cloud, and near to all that went.
-    away = np.linalg.norm(points[:, None] - thinned[None], axis=2).min(axis=1)
+    away = norm(points[:, None] - thinned[None], axis=2).min(axis=1)
     assert away.max() < 1.01 * cell * 3**0.5

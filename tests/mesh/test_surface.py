@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 
 from conftest import as_mesh, as_trimesh
 from igps.mesh import surface
@@ -10,21 +11,15 @@ from igps.mesh import surface
 
 def test_areas_and_normals(blob):
     oracle = as_trimesh(blob)
-    np.testing.assert_allclose(
-        surface.face_areas(blob.vertices, blob.faces), oracle.area_faces, rtol=1e-12
-    )
+    assert_allclose(surface.face_areas(blob.vertices, blob.faces), oracle.area_faces, rtol=1e-12)
     of_vertices = np.zeros(len(blob.vertices))
     sums = np.zeros_like(blob.vertices)
     for face, area, normal in zip(blob.faces, oracle.area_faces, oracle.face_normals, strict=True):
         of_vertices[face] += area / 3
         sums[face] += area * normal
-    np.testing.assert_allclose(
-        surface.vertex_areas(blob.vertices, blob.faces), of_vertices, rtol=1e-12
-    )
+    assert_allclose(surface.vertex_areas(blob.vertices, blob.faces), of_vertices, rtol=1e-12)
     normals = sums / np.linalg.norm(sums, axis=1, keepdims=True)
-    np.testing.assert_allclose(
-        surface.vertex_normals(blob.vertices, blob.faces), normals, atol=1e-12
-    )
+    assert_allclose(surface.vertex_normals(blob.vertices, blob.faces), normals, atol=1e-12)
 
 
 def test_the_mean_of_neighbours_is_that_of_a_loop(blob):
@@ -33,9 +28,7 @@ def test_the_mean_of_neighbours_is_that_of_a_loop(blob):
         beside = blob.vertices[neighbours]
         weights = 1 / np.square(beside - blob.vertices[i]).sum(axis=1)
         expected[i] = weights @ beside / weights.sum()
-    np.testing.assert_allclose(
-        surface.mean_of_neighbours(blob.vertices, blob.faces), expected, rtol=1e-9
-    )
+    assert_allclose(surface.mean_of_neighbours(blob.vertices, blob.faces), expected, rtol=1e-9)
 
 
 def test_a_neighbour_in_the_same_place_is_the_mean(blob):
@@ -44,7 +37,7 @@ def test_a_neighbour_in_the_same_place_is_the_mean(blob):
     vertices[a] = vertices[b]
     found = surface.mean_of_neighbours(vertices, blob.faces)
     expected = vertices[[b, b]]
-    np.testing.assert_allclose(found[[a, b]], expected, atol=1e-6)
+    assert_allclose(found[[a, b]], expected, atol=1e-6)
 
 
 def test_edges(blob):
@@ -56,7 +49,7 @@ def test_edges(blob):
     assert found == [list(side) for side in sides]
     expected = sorted({(min(side), max(side)) for side in sides})
     assert edges.tolist() == [list(edge) for edge in expected]
-    np.testing.assert_array_equal(edges[edge_of], np.sort(sides, axis=1))
+    assert_array_equal(edges[edge_of], np.sort(sides, axis=1))
 
 
 @pytest.mark.parametrize("n_handles", [0, 1, 2, 3])
@@ -80,8 +73,6 @@ def test_parts_of_faces_and_their_areas():
     faces = np.where(whole.faces >= 162, whole.faces + 1, whole.faces)
     shuffled = np.random.default_rng(0).permutation(len(faces))
     part, areas = surface.face_parts(vertices, faces[shuffled])
-    np.testing.assert_array_equal(
-        part, np.repeat([0, 1, 2], [len(piece.faces) for piece in pieces])[shuffled]
-    )
+    assert_array_equal(part, np.repeat([0, 1, 2], [len(piece.faces) for piece in pieces])[shuffled])
     expected = [piece.area for piece in pieces]
-    np.testing.assert_allclose(areas, expected, rtol=1e-12)
+    assert_allclose(areas, expected, rtol=1e-12)

@@ -1,5 +1,6 @@
 import numpy as np
 import trimesh
+from numpy.testing import assert_allclose
 
 from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh
@@ -28,9 +29,9 @@ def test_boxes_that_overlap_are_one_body_of_the_right_volume_and_area():
     assert repair_steps(body.notes) == ("united",)
     # The second box reaches 0.7 into the first.
     expected = 2 + 1.0 * 0.5 * 0.5
-    np.testing.assert_allclose(body.volume, expected, rtol=1e-12)
+    assert_allclose(body.volume, expected, rtol=1e-12)
     expected = 10 + 4 * 0.5 * 1.0
-    np.testing.assert_allclose(body.area, expected, rtol=1e-12)
+    assert_allclose(body.area, expected, rtol=1e-12)
 
 
 def test_parts_that_do_not_touch_or_are_open_are_left_to_the_grid():
@@ -56,7 +57,7 @@ def test_a_wall_between_two_halves_is_dropped_and_nothing_else():
     assert any("dropped 1 wall inside" in note for note in body.notes)
     assert "watertight" not in repair_steps(body.notes)
     found = (body.volume, body.area)
-    np.testing.assert_allclose(found, (2, 10), rtol=1e-12)
+    assert_allclose(found, (2, 10), rtol=1e-12)
 
 
 def test_two_halves_with_a_wall_each_that_overlap_are_the_body_that_they_were_cut_from():
@@ -76,4 +77,4 @@ def test_two_halves_with_a_wall_each_that_overlap_are_the_body_that_they_were_cu
     assert "watertight" not in repair_steps(body.notes)
     found = (body.volume, body.area)
     expected = (shape.volume, shape.area)
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert_allclose(found, expected, rtol=1e-9)

@@ -6,8 +6,12 @@ from collections import Counter
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from tests.mesh.damages import DAMAGES
+from trimesh.creation import box, cylinder, torus
 
 from igps.mesh.errors import MeshError
 from igps.mesh.mending import mend
@@ -58,14 +62,14 @@ def assert_closed(mesh):
 
 def test_ball_of_loose_turned_triangles():
     vertices, faces = arrays(ball(subdivisions=4))
-    generator = np.random.default_rng(0)
+    generator = default_rng(0)
     soup = vertices[generator.permutation(faces)].reshape(-1, 3)
     loose = np.arange(len(soup)).reshape(-1, 3)
     turned = generator.random(len(loose)) < 1 / 3
     loose[turned] = loose[turned, ::-1]
     body = watertight(soup, loose)
     assert_closed(body)
-    radius = np.linalg.norm(body.vertices, axis=1)
+    radius = norm(body.vertices, axis=1)
     cell = 2 / 96
     assert np.abs(radius - 1).max() < cell / 2
     assert body.volume == pytest.approx(BALL, rel=0.01)
@@ -76,9 +80,9 @@ def test_ball_of_loose_turned_triangles():
 @pytest.mark.parametrize(
     "solid",
     [
-        trimesh.creation.box((1, 0.9, 0.8)),
-        trimesh.creation.box((1, 1, 0.05)),
-        trimesh.creation.cylinder(0.05, 1, sections=64),
+        box((1, 0.9, 0.8)),
+        box((1, 1, 0.05)),
+        cylinder(0.05, 1, sections=64),
     ],
     ids=["block", "thin plate", "rod"],
 )
@@ -105,7 +109,7 @@ def test_a_hole_is_closed_and_a_cup_stays_open():
 
 
 def test_a_missing_base_is_no_leak_beyond_the_bounding_box():
-    surface = trimesh.creation.box((1, 1, 4)).subdivide_to_size(0.2)
+    surface = box((1, 1, 4)).subdivide_to_size(0.2)
     faces = np.asarray(surface.faces)[surface.triangles_center[:, 2] > -1.99]
     body = watertight(np.asarray(surface.vertices), faces, resolution=64)
     assert_closed(body)
@@ -129,17 +133,17 @@ def test_the_neck_of_a_bottle_is_closed_unless_its_wall_has_two_sides():
 
 def test_what_is_hidden_is_filled():
     body = watertight(
-        *arrays(ball(), ball(0.3, (0.2, 0, 0)), trimesh.creation.box((0.5, 0.4, 0.3))),
+        *arrays(ball(), ball(0.3, (0.2, 0, 0)), box((0.5, 0.4, 0.3))),
         resolution=64,
     )
     alone = watertight(*arrays(ball()), resolution=64)
     assert body.volume == pytest.approx(alone.volume, rel=1e-4)
-    assert np.linalg.norm(body.vertices, axis=1).min() > 0.98
+    assert norm(body.vertices, axis=1).min() > 0.98
 
 
 def test_overlapping_parts_are_one():
-    first = trimesh.creation.box((1, 1, 1))
-    second = trimesh.creation.box((1, 1, 1))
+    first = box((1, 1, 1))
+    second = box((1, 1, 1))
     second.apply_translation([0.6, 0.3, 0.2])
     body = watertight(*arrays(first, second))
     assert_closed(body)
@@ -150,16 +154,14 @@ def test_overlapping_parts_are_one():
 @pytest.mark.parametrize("turned", [(False, True), (True, True)])
 def test_parts_are_turned_outward_by_their_winding_numbers(turned):
     # Two rings: the far sides of each face its middle, so that no simple rule tells their outside.
-    rings = [
-        trimesh.creation.torus(10.0, 1.0, major_sections=48, minor_sections=16) for _ in range(2)
-    ]
+    rings = [torus(10.0, 1.0, major_sections=48, minor_sections=16) for _ in range(2)]
     rings[1].apply_transform(trimesh.transformations.rotation_matrix(1.2, [1, 0, 0]))
     for ring, inverted in zip(rings, turned, strict=True):
         if inverted:
             ring.invert()
     vertices, faces = arrays(*rings)
     # A fortieth of the faces is missing from one place.
-    away = np.linalg.norm(vertices[faces].mean(axis=1) - [10, 0, 0], axis=1)
+    away = norm(vertices[faces].mean(axis=1) - [10, 0, 0], axis=1)
     body = watertight(vertices, faces[np.argsort(away)[len(faces) // 40 :]], resolution=64)
     inside = (-10, 0, 0), (0, 10, 0), (0, 10 * np.cos(1.2), 10 * np.sin(1.2))
     assert is_inside(body, *inside) == [True] * 3
@@ -188,7 +190,7 @@ def test_parts_that_share_an_edge_are_one():
 
 
 def test_a_wall_inside_that_lies_on_points_of_the_grid_is_filled():
-    left = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
+    left = box((1, 1, 1)).subdivide().subdivide()
     # Whose squares in the wall are cut along the other diagonal
     right = left.copy().apply_translation([1, 0, 0])
     mesh = watertight(*arrays(left, right))
@@ -218,7 +220,7 @@ def test_pieces_are_joined_and_specks_dropped():
     assert any("joined 2 pieces" in note for note in apart.notes)
     speck = watertight(*arrays(ball(), ball(0.01, (5, 5, 5))), resolution=48)
     alone = watertight(*arrays(ball()), resolution=48)
-    np.testing.assert_array_equal(speck.vertices, alone.vertices)
+    assert_array_equal(speck.vertices, alone.vertices)
 
 
 def test_wires_stay_in_one_piece():
@@ -231,27 +233,27 @@ def test_wires_stay_in_one_piece():
     assert_closed(body)
     found = np.ptp(body.vertices, axis=0)
     expected = np.ptp(strip, axis=0)
-    np.testing.assert_allclose(found, expected, atol=0.08)
+    assert_allclose(found, expected, atol=0.08)
 
 
 @pytest.mark.parametrize("with_normals", [True, False])
 def test_point_clouds(with_normals):
-    points = np.random.default_rng(0).standard_normal((6000, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points = default_rng(0).standard_normal((6000, 3))
+    points /= norm(points, axis=1, keepdims=True)
     body = watertight(points, normals=points if with_normals else None, resolution=64)
     assert_closed(body)
     assert body.volume == pytest.approx(BALL, rel=0.03)
 
 
 def test_flat_places_have_a_delaunay_triangulation():
-    body = watertight(*arrays(trimesh.creation.box((1, 1, 0.6))), resolution=48, max_vertices=500)
+    body = watertight(*arrays(box((1, 1, 0.6))), resolution=48, max_vertices=500)
     assert_closed(body)
     opposite = {}
     for face in body.faces.tolist():
         for i in range(3):
             corner = face[i - 1]
             u, v = (body.vertices[face[k]] - body.vertices[corner] for k in (i, (i + 1) % 3))
-            cosine = u @ v / np.linalg.norm(u) / np.linalg.norm(v)
+            cosine = u @ v / norm(u) / norm(v)
             opposite[face[i], face[(i + 1) % 3]] = np.arccos(np.clip(cosine, -1, 1))
     sums = np.array([angle + opposite[b, a] for (a, b), angle in opposite.items()])
     # All but a few along the box's edges, where the surface bends.
@@ -260,11 +262,11 @@ def test_flat_places_have_a_delaunay_triangulation():
 
 
 def test_follows_the_surface_when_it_is_moved_and_scaled():
-    vertices, faces = arrays(trimesh.creation.torus(1.0, 0.3))
+    vertices, faces = arrays(torus(1.0, 0.3))
     body = watertight(vertices, faces, resolution=64)
     moved = watertight(vertices * 8 + [16, -32, 64], faces, resolution=64)
     expected = body.vertices * 8 + [16, -32, 64]
-    np.testing.assert_allclose(moved.vertices, expected, atol=8 * 0.02)
+    assert_allclose(moved.vertices, expected, atol=8 * 0.02)
     expected = pytest.approx(2 * np.pi**2 * 0.09, rel=0.03)
     assert body.volume == expected
     euler = len(body.vertices) - len(body.faces) // 2
@@ -274,7 +276,7 @@ def test_follows_the_surface_when_it_is_moved_and_scaled():
 def test_many_triangles_are_rounded_first(monkeypatch):
     monkeypatch.setattr("igps.mesh.watertight._MAX_FACES", 1000)
     body = watertight(*arrays(ball(subdivisions=5)), resolution=64)
-    assert np.abs(np.linalg.norm(body.vertices, axis=1) - 1).max() < 0.5 * 2 / 64
+    assert np.abs(norm(body.vertices, axis=1) - 1).max() < 0.5 * 2 / 64
     assert body.volume == pytest.approx(BALL, rel=0.01)
 
 
@@ -282,8 +284,8 @@ def test_inputs_stay_as_they_are():
     vertices, faces = arrays(ball())
     before = vertices.copy(), faces.copy()
     watertight(vertices, faces, resolution=24)
-    np.testing.assert_array_equal(vertices, before[0])
-    np.testing.assert_array_equal(faces, before[1])
+    assert_array_equal(vertices, before[0])
+    assert_array_equal(faces, before[1])
 
 
 def test_what_is_no_surface_is_refused():
@@ -296,7 +298,7 @@ def test_what_is_no_surface_is_refused():
     with pytest.raises(
         MeshError, match=r"five\.xyz: expected at least 10 points for a surface, got 5"
     ):
-        watertight(np.random.default_rng(0).random((5, 3)), name="five.xyz")
+        watertight(default_rng(0).random((5, 3)), name="five.xyz")
     with pytest.raises(MeshError, match="finite"):
         watertight(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
     with pytest.raises(ValueError, match="resolution"):
@@ -320,13 +322,13 @@ def test_a_chain_of_beads_gets_a_grid_as_fine_as_its_beads_ask_for(gap):
     assert body.area == expected
     # Between beads it is thin again.
     near = np.abs(body.vertices[:, 0] - 30.5 * gap) < 0.1
-    assert np.linalg.norm(body.vertices[near, 1:], axis=1).max() < 0.6
+    assert norm(body.vertices[near, 1:], axis=1).max() < 0.6
     for note in body.notes:
         assert "coarse" not in note
 
 
 def test_a_long_rod_is_as_thick_as_it_was():
-    rod = trimesh.creation.cylinder(0.005, 1, sections=32)
+    rod = cylinder(0.005, 1, sections=32)
     body = watertight(*arrays(rod))
     assert body.volume == pytest.approx(rod.volume, rel=0.03)
     assert body.area == pytest.approx(rod.area, rel=0.03)
@@ -334,8 +336,8 @@ def test_a_long_rod_is_as_thick_as_it_was():
 
 def test_a_note_tells_that_the_grid_is_too_coarse():
     """Thin rods in all directions, for which the grid cannot be refined enough."""
-    rods = [trimesh.creation.cylinder(0.004, 1, sections=12) for _ in range(12)]
-    generator = np.random.default_rng(0)
+    rods = [cylinder(0.004, 1, sections=12) for _ in range(12)]
+    generator = default_rng(0)
     for rod in rods:
         rod.apply_transform(trimesh.transformations.random_rotation_matrix(generator.random(3)))
     body = watertight(*arrays(*rods), resolution=32)

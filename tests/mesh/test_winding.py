@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
 
 from bodies import bumpy_sphere, cube, exterior_points, interior_points, torus
 from igps.mesh.winding import winding_number
@@ -12,12 +14,10 @@ from igps.mesh.winding import winding_number
 )
 def test_winding_number_is_one_inside_and_zero_outside(mesh):
     found = winding_number(*mesh, interior_points(mesh, 100))
-    np.testing.assert_allclose(found, 1, atol=1e-12)
+    assert_allclose(found, 1, atol=1e-12)
     found = winding_number(*mesh, exterior_points(mesh, 100))
-    np.testing.assert_allclose(found, 0, atol=1e-12)
-    np.testing.assert_allclose(
-        winding_number(mesh[0], mesh[1][:, ::-1], mesh[0][:1] / 2 + 100), 0, atol=1e-12
-    )
+    assert_allclose(found, 0, atol=1e-12)
+    assert_allclose(winding_number(mesh[0], mesh[1][:, ::-1], mesh[0][:1] / 2 + 100), 0, atol=1e-12)
 
 
 def winding_by_loops(vertices, faces, points):
@@ -25,11 +25,8 @@ def winding_by_loops(vertices, faces, points):
     total = np.zeros(len(points))
     for i, point in enumerate(points):
         for corners in vertices[faces] - point:
-            a, b, c = corners / np.linalg.norm(corners, axis=1, keepdims=True)
-            sides = [
-                2 * np.arctan2(np.linalg.norm(p - q), np.linalg.norm(p + q))
-                for p, q in ((b, c), (c, a), (a, b))
-            ]
+            a, b, c = corners / norm(corners, axis=1, keepdims=True)
+            sides = [2 * np.arctan2(norm(p - q), norm(p + q)) for p, q in ((b, c), (c, a), (a, b))]
             half = sum(sides) / 2
             tangents = np.tan(half / 2) * np.prod([np.tan((half - side) / 2) for side in sides])
             total[i] += (
@@ -54,14 +51,12 @@ def test_winding_number_is_the_sum_of_solid_angles(kind):
     expected = winding_by_loops(vertices, faces, points)
     assert np.ptp(expected) > 0.5
     found = winding_number(vertices, faces, points)
-    np.testing.assert_allclose(found, expected, atol=1e-7)
+    assert_allclose(found, expected, atol=1e-7)
     flat = np.array([[0, 1, 1], [2, 2, 2]])
     for more in (np.concatenate([faces, flat]), np.concatenate([np.tile(flat, (40, 1)), faces])):
         found = winding_number(vertices, more, points)
-        np.testing.assert_allclose(found, expected, atol=1e-7)
-    np.testing.assert_allclose(
-        winding_number(1e3 + vertices, faces, 1e3 + points), expected, atol=1e-7
-    )
+        assert_allclose(found, expected, atol=1e-7)
+    assert_allclose(winding_number(1e3 + vertices, faces, 1e3 + points), expected, atol=1e-7)
 
 
 def test_winding_number_of_flat_faces_alone_is_refused():

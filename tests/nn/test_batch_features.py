@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from torch.nn.functional import normalize
+from torch.testing import assert_close
 
 from batches import N_POINTS, alone, embedded, scaled, two_bodies
 from igps.nn.batch_features import (
@@ -22,24 +23,22 @@ def test_nearest_directions_are_those_of_a_loop():
     for point, direction in zip(points, found, strict=True):
         nearest = (targets - point).norm(dim=1).argsort()[:3]
         mean = targets[nearest].mean(dim=0)
-        torch.testing.assert_close(direction, normalize(mean - point, dim=0))
+        assert_close(direction, normalize(mean - point, dim=0))
     whole = nearest_directions(points, targets, mask, n_nearest=50)
     expected = normalize(targets.mean(dim=0) - points, dim=1)
-    torch.testing.assert_close(whole, expected)
+    assert_close(whole, expected)
     few = nearest_directions(
         points, targets.masked_fill(torch.arange(20)[:, None] > 4, torch.nan), torch.arange(20) < 5
     )
     expected = normalize(targets[:5].mean(dim=0) - points, dim=1)
-    torch.testing.assert_close(few, expected)
+    assert_close(few, expected)
 
 
 def test_positions_do_not_change_with_scale():
     batch = two_bodies()
     large = scaled(two_bodies(), 8.0)
     expected = SampleFeatures(batch, "interior", batch.interior).positions()
-    torch.testing.assert_close(
-        SampleFeatures(large, "interior", large.interior).positions(), expected
-    )
+    assert_close(SampleFeatures(large, "interior", large.interior).positions(), expected)
     by_hand = batch.interior.points.numpy() / np.sqrt([2.0, 3.0])[:, None, None]
     np.testing.assert_allclose(expected, by_hand, rtol=1e-6)
 
@@ -58,7 +57,7 @@ def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind):
         single = alone(batch, i)
         samples = SampleFeatures(single, kind, getattr(single, kind))
         unpadded = samples.embedded_directions(embedding)
-        torch.testing.assert_close(unpadded[0], directions[i, :n])
+        assert_close(unpadded[0], directions[i, :n])
 
 
 def test_neighbours_in_the_embedding_are_found_once_whatever_the_padding():

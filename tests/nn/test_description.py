@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
+from numpy.testing import assert_allclose
+from trimesh.creation import icosphere
 
 import jobs
 from igps.data.dataset import SignatureDataset
@@ -27,7 +28,7 @@ CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface
 def dataset(tmp_path_factory):
     root = tmp_path_factory.mktemp("described")
     for i in range(4):
-        body = trimesh.creation.icosphere(subdivisions=2)
+        body = icosphere(subdivisions=2)
         body.vertices *= [1.0, 1.0 + 0.2 * i, 1.5]
         body.export(root / f"{i}.off")
     return SignatureDataset(sorted(root.glob("*.off")), CONFIG, root / "cache")
@@ -84,7 +85,7 @@ def test_a_name_in_place_of_a_descriptor_is_told(dataset):
 def test_meshes_come_to_descriptors_that_need_them(dataset):
     expected = [[dataset.mesh(i).area, dataset[i].signature.area] for i in range(4)]
     found = describe(dataset, Area(), n_workers=1)
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(dataset):
@@ -127,9 +128,7 @@ def test_a_descriptor_that_needs_more_refuses(dataset, function):
 def test_what_cannot_be_described_is_listed(dataset):
     area = Area(refused="2.off")
     values, failures = describe_usable(dataset, area, n_workers=1)
-    np.testing.assert_allclose(
-        values[:, 1], [dataset[i].signature.area for i in (0, 1, 3)], rtol=1e-6
-    )
+    assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 1, 3)], rtol=1e-6)
     (failure,) = failures
     assert failure.path == dataset.bodies.paths[2]
     assert failure.error == f"{failure.path}: it is not to my liking"
@@ -153,9 +152,7 @@ def test_a_mesh_that_cannot_be_read_is_listed(dataset, tmp_path):
 
 def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset):
     values, failures = describe_usable(dataset, Area(refused="1.off", dies=True), n_workers=2)
-    np.testing.assert_allclose(
-        values[:, 1], [dataset[i].signature.area for i in (0, 2, 3)], rtol=1e-6
-    )
+    assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 2, 3)], rtol=1e-6)
     found = [failure.path for failure in failures]
     expected = [dataset.bodies.paths[1]]
     assert found == expected
@@ -194,7 +191,7 @@ def asked(dataset, cache_tag="one"):
 @pytest.fixture
 def fresh(tmp_path):
     for i in range(3):
-        body = trimesh.creation.icosphere(subdivisions=2)
+        body = icosphere(subdivisions=2)
         body.vertices *= [1.0, 1.0 + 0.2 * i, 1.5]
         body.export(tmp_path / f"{i}.off")
     paths = sorted(tmp_path.glob("*.off"))
@@ -226,7 +223,7 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh):
         paths, CONFIG, fresh.pipeline.cache_dir, attributes={"height": lambda x: x[:, 2]}
     )
     assert asked(with_own)[0] == asked(with_own)[0] == ["0", "1", "2"]
-    body = trimesh.creation.icosphere(subdivisions=2)
+    body = icosphere(subdivisions=2)
     body.vertices *= [2.0, 0.7, 0.5]
     body.export(paths[1])
     names, other = asked(fresh)

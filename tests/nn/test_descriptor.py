@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from batches import alone, scaled, two_bodies
 from igps.data.requirements import Requirements
@@ -72,18 +73,14 @@ def test_padding_never_shows(batch, make):
     with torch.no_grad():
         together = descriptor(batch)
         for i in range(2):
-            torch.testing.assert_close(
-                descriptor(alone(batch, i))[0], together[i], rtol=0, atol=1e-6
-            )
+            assert_close(descriptor(alone(batch, i))[0], together[i], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("make", MAKERS)
 def test_does_not_change_with_scale(batch, make):
     descriptor = make()
     with torch.no_grad():
-        torch.testing.assert_close(
-            descriptor(scaled(batch, 8.0)), descriptor(batch), rtol=0, atol=1e-6
-        )
+        assert_close(descriptor(scaled(batch, 8.0)), descriptor(batch), rtol=0, atol=1e-6)
 
 
 def test_everything_learns(batch):
@@ -118,7 +115,7 @@ def test_compiled_equals_eager(batch):
     parameters = list(descriptor.parameters())
     torch.compiler.reset()
     compiled = torch.compile(descriptor, backend="aot_eager")
-    torch.testing.assert_close(
+    assert_close(
         gradients(compiled, batch, parameters),
         gradients(descriptor, batch, parameters),
         rtol=1e-4,
@@ -132,9 +129,7 @@ def test_cuda_equals_cpu(batch):
     expected = gradients(descriptor, batch, list(descriptor.parameters()))
     descriptor.cuda()
     result = gradients(descriptor, batch.to("cuda"), list(descriptor.parameters()))
-    torch.testing.assert_close(
-        [value.cpu() for value in result], list(expected), rtol=1e-3, atol=1e-6
-    )
+    assert_close([value.cpu() for value in result], list(expected), rtol=1e-3, atol=1e-6)
 
 
 def test_cells_are_counted_by_part(batch):
@@ -168,9 +163,9 @@ def test_parts_have_their_shares_and_their_histograms_equal_ones(batch, shares, 
         share * one(batch).flatten(1)
         for share, one in zip((of_first / 2, of_first / 2, 1 - of_first), histograms, strict=True)
     ]
-    torch.testing.assert_close(result, torch.cat(expected, dim=1))
+    assert_close(result, torch.cat(expected, dim=1))
     found = result.sum(dim=1)
-    torch.testing.assert_close(found, torch.ones(2))
+    assert_close(found, torch.ones(2))
 
 
 class Counting(SpectralEmbedding):
@@ -204,7 +199,7 @@ def test_subset_of_samples_is_the_same_in_any_batch(batch):
     together = descriptor(batch)
     for i in range(2):
         found = descriptor(alone(batch, i))[0]
-        torch.testing.assert_close(found, together[i])
+        assert_close(found, together[i])
     assert not torch.allclose(together, HistogramDescriptor(small(5, 2))(batch))
 
 
@@ -217,9 +212,7 @@ def test_training_draws_another_subset_each_time(batch):
     assert not torch.equal(one[:, :first], other[:, :first])
     assert torch.equal(one[:, first:], other[:, first:])
     descriptor.eval()
-    torch.testing.assert_close(
-        descriptor(batch), HistogramDescriptor([small(5, 2), small(5, 1)])(batch)
-    )
+    assert_close(descriptor(batch), HistogramDescriptor([small(5, 2), small(5, 1)])(batch))
 
 
 def test_needs_are_those_of_all_histograms(batch):
@@ -279,7 +272,7 @@ def test_a_descriptor_of_bodies_sees_each_without_padding(batch):
     assert described.dtype == torch.float32
     largest = [float(batch.interior.points[i].abs().max()) for i in range(2)]
     expected = torch.tensor([[40, 12, largest[0], 2], [25, 7, largest[1], 3]])
-    torch.testing.assert_close(described, expected)
+    assert_close(described, expected)
 
 
 @pytest.mark.parametrize("make", [*MAKERS, Extent])
@@ -299,12 +292,8 @@ def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch):
     assert descriptor.requirements == below.requirements
     embedding = descriptor(batch)
     roots = below(batch).sqrt() - below(batch).sqrt().mean(dim=0)
-    torch.testing.assert_close(
-        embedding, roots / roots.norm(dim=1, keepdim=True), atol=1e-5, rtol=0
-    )
-    torch.testing.assert_close(
-        descriptor.distances(embedding, embedding), cosine(embedding, embedding)
-    )
+    assert_close(embedding, roots / roots.norm(dim=1, keepdim=True), atol=1e-5, rtol=0)
+    assert_close(descriptor.distances(embedding, embedding), cosine(embedding, embedding))
     assert descriptor.shorten(embedding) is embedding
     with pytest.raises(
         ValueError, match=r"expected a head that shortens its embeddings.*WhitenedHead.*300 numbers"
@@ -320,7 +309,7 @@ def test_coordinates_of_histograms_are_their_roots(batch):
     histograms = paper()(batch)
     found = paper().coordinates(histograms).square()
     expected = histograms.flatten(1)
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     kept = EmbeddedDescriptor(paper(), WhitenedHead())
     assert kept.coordinates(histograms.flatten(1)).equal(histograms.flatten(1))
 

@@ -7,6 +7,7 @@ import yaml
 from pytorch_lightning import Callback, Trainer, seed_everything
 from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_metric_learning.losses import TripletMarginLoss
+from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
 from igps.data.collation import collate
@@ -119,7 +120,7 @@ def test_training_moves_bins_filter_and_head_and_is_reproducible(shapes, tmp_pat
         assert any(part in name for name in moved), part
     for name, value in states[0].items():
         found = states[1][name]
-        torch.testing.assert_close(found, value, atol=0, rtol=0)
+        assert_close(found, value, atol=0, rtol=0)
     for name in states[0]:
         assert not name.startswith("scores")
 
@@ -141,7 +142,7 @@ def test_a_checkpoint_has_the_scale_of_its_own_epoch(shapes, tmp_path):
     histograms = describe(module.dataset.subset(module.split.train), fresh.descriptor)
     fresh.distance.calibrate(histograms)
     for name in ("plain_unit", "learned_unit"):
-        torch.testing.assert_close(state[f"distance.{name}"], getattr(fresh.distance, name))
+        assert_close(state[f"distance.{name}"], getattr(fresh.distance, name))
         assert state[f"distance.{name}"] != 1
 
 
@@ -184,9 +185,7 @@ def test_a_head_in_closed_form_follows_the_bins(shapes, tmp_path, validated):
     assert cells == (3 * 16, 9)
     expected = WhitenedHead(4).fit(describe(part, model.descriptor), part.labels, cells)
     for name, value in expected.state_dict().items():
-        torch.testing.assert_close(
-            model.distance.head.state_dict()[name].abs(), value.abs(), atol=1e-4, rtol=0
-        )
+        assert_close(model.distance.head.state_dict()[name].abs(), value.abs(), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("make", [ProjectionHead, WhitenedHead, KernelHead])
@@ -217,23 +216,19 @@ def test_any_loader_of_labelled_batches_trains(items, tmp_path, make):
         descriptions = loaded(collate(items))
         found = loaded.distances(descriptions, descriptions)
         model.eval()
-        torch.testing.assert_close(
-            found, model.distances(descriptions, descriptions), atol=1e-5, rtol=1e-4
-        )
-        torch.testing.assert_close(model(collate(items)), descriptions, atol=1e-6, rtol=0)
+        assert_close(found, model.distances(descriptions, descriptions), atol=1e-5, rtol=1e-4)
+        assert_close(model(collate(items)), descriptions, atol=1e-6, rtol=0)
     head = loaded.distance.head
     fitted = head.whitened if isinstance(head, KernelHead) else head
     if make is ProjectionHead:
         assert len(fitted.mean) == 48
         assert (fitted.mean > 0).any()
     else:
-        torch.testing.assert_close(
-            fitted.mean, descriptions.flatten(1).sqrt().mean(dim=0), atol=1e-6, rtol=1e-4
-        )
+        assert_close(fitted.mean, descriptions.flatten(1).sqrt().mean(dim=0), atol=1e-6, rtol=1e-4)
     # Both parts of the distance on the scale of the training shapes.
     pairs = torch.triu_indices(len(items), len(items), 1).unbind()
     plain = chi_square(descriptions, descriptions)[pairs].median()
-    torch.testing.assert_close(loaded.distance.plain_unit, plain, atol=1e-6, rtol=1e-4)
+    assert_close(loaded.distance.plain_unit, plain, atol=1e-6, rtol=1e-4)
     assert found[pairs].median() == pytest.approx(1, abs=0.5)
 
 

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch.autograd import forward_ad
+from torch.autograd import forward_ad, grad
+from torch.testing import assert_close
 
 import igps.nn.functional as functional
 from batches import alone, exported, tensors, two_bodies
@@ -58,16 +59,16 @@ def module(request):
 
 def gradients(module, batch):
     loss = module(batch).square().sum()
-    return list(torch.autograd.grad(loss, list(module.parameters()))) if loss.requires_grad else []
+    return list(grad(loss, list(module.parameters()))) if loss.requires_grad else []
 
 
 def test_the_whole_graph_is_traced(module):
     batch = two_bodies()
     torch.compiler.reset()
     traced = torch.compile(module, backend="aot_eager", fullgraph=True)
-    torch.testing.assert_close(traced(batch), module(batch), rtol=0, atol=1e-6)
+    assert_close(traced(batch), module(batch), rtol=0, atol=1e-6)
     for found, expected in zip(gradients(traced, batch), gradients(module, batch), strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-7)
+        assert_close(found, expected, rtol=1e-4, atol=1e-7)
 
 
 def test_what_is_compiled_does_not_grow_with_the_samples(module, monkeypatch):
@@ -106,7 +107,7 @@ def test_a_compiled_program_serves_any_number_of_bodies():
     with torch.no_grad():
         for n in range(2, 6):
             bodies = SignatureBatch.concatenate([batch] * n)
-            torch.testing.assert_close(compiled(bodies), descriptor(bodies), rtol=0, atol=1e-6)
+            assert_close(compiled(bodies), descriptor(bodies), rtol=0, atol=1e-6)
     assert len(programs) == 2  # the second time with any number
 
 
@@ -125,17 +126,15 @@ def test_an_exported_program_takes_any_number_of_bodies_and_samples(module):
             replace(batch, **fewer),
         ):
             found = program(*tensors(one))
-            torch.testing.assert_close(found, descriptor(one), rtol=0, atol=1e-6)
+            assert_close(found, descriptor(one), rtol=0, atol=1e-6)
 
 
 def test_double_precision_stays_double(module):
     single = module(two_bodies()).detach()
     result = module.double()(two_bodies().to(torch.float64))
     assert result.dtype == torch.float64
-    torch.testing.assert_close(result.detach(), single.double(), rtol=0, atol=1e-5)
-    torch.testing.assert_close(
-        result.flatten(1).sum(dim=1).detach(), torch.ones(2).double(), rtol=0, atol=1e-12
-    )
+    assert_close(result.detach(), single.double(), rtol=0, atol=1e-5)
+    assert_close(result.flatten(1).sum(dim=1).detach(), torch.ones(2).double(), rtol=0, atol=1e-12)
 
 
 def test_transforms_of_functions_follow_a_histogram(module):
@@ -150,18 +149,14 @@ def test_transforms_of_functions_follow_a_histogram(module):
         return (module(replace(batch, area=area)) * upstream).sum()
 
     area = batch.area.clone().requires_grad_()
-    (expected,) = torch.autograd.grad(loss(area) + 0 * area.sum(), area)
+    (expected,) = grad(loss(area) + 0 * area.sum(), area)
     found = torch.func.grad(loss)(batch.area)
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     direction = torch.tensor([1.0, -2.0]).double()
-    torch.testing.assert_close(
-        torch.func.jvp(loss, (batch.area,), (direction,))[1], expected @ direction
-    )
+    assert_close(torch.func.jvp(loss, (batch.area,), (direction,))[1], expected @ direction)
     with forward_ad.dual_level():
         along = forward_ad.unpack_dual(loss(forward_ad.make_dual(batch.area, direction))).tangent
-        torch.testing.assert_close(
-            torch.zeros(()).double() if along is None else along, expected @ direction
-        )
+        assert_close(torch.zeros(()).double() if along is None else along, expected @ direction)
 
 
 def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differences(module):
@@ -186,7 +181,7 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
         return (module(moved) * upstream).sum()
 
     leaves = (interior, surface, eigenvalues)
-    found = torch.autograd.grad(loss(), leaves, allow_unused=True)
+    found = grad(loss(), leaves, allow_unused=True)
     compared = 0
     for leaf, gradient in zip(leaves, found, strict=True):
         if gradient is None or not gradient.any():
@@ -229,20 +224,16 @@ def test_padding_leaves_second_derivatives_as_they_are(module):
     for one, row in ((batch, 1), (alone(batch, 1), 0)):
         leaves = (one.eigenvalues.clone().requires_grad_(), one.area.clone().requires_grad_())
         cells = module(replace(one, eigenvalues=leaves[0], area=leaves[1]))[row] * upstream
-        gradients = torch.autograd.grad(cells.sum(), leaves, create_graph=True, allow_unused=True)
+        gradients = grad(cells.sum(), leaves, create_graph=True, allow_unused=True)
         total = sum(
             (g.square().sum() for g in gradients if g is not None), torch.zeros(()).double()
         )
-        second = (
-            torch.autograd.grad(total, leaves, allow_unused=True)
-            if total.requires_grad
-            else (None, None)
-        )
+        second = grad(total, leaves, allow_unused=True) if total.requires_grad else (None, None)
         found.append([None if values is None else values[row].flatten()[:7] for values in second])
     for padded, plain in zip(*found, strict=True):
         assert (padded is None) == (plain is None)
         if padded is not None and plain is not None:
-            torch.testing.assert_close(padded, plain, rtol=1e-9, atol=1e-12)
+            assert_close(padded, plain, rtol=1e-9, atol=1e-12)
 
 
 def test_a_state_is_read_back_to_the_last_key(module):
@@ -264,7 +255,7 @@ def test_functions_stand_beside_the_modules():
     )
     found = functional.pair_histogram(embedding, functional.barycentroid_potential(embedding))
     expected = PairHistogram()(batch)[1]
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    assert_close(found, expected, rtol=0, atol=1e-6)
     assert float(functional.chi_square(found[None].flatten(1), found[None].flatten(1))) == 0
     for name in functional.__all__:
         assert callable(getattr(functional, name))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 from test_views import CENTRE, ORIENTATIONS, marked_ball, write
 
 from igps.mesh.loading import load_mesh, read_surface
@@ -35,7 +36,7 @@ def test_voxels_have_the_grid_of_the_label_image(exported):
     assert found.GetSize() == labels.GetSize()
     for read in ("GetSpacing", "GetOrigin", "GetDirection"):
         expected = getattr(labels, read)()
-        np.testing.assert_allclose(getattr(found, read)(), expected, atol=1e-4)
+        assert_allclose(getattr(found, read)(), expected, atol=1e-4)
     numbers = SimpleITK.GetArrayFromImage(found)
     assert ((numbers > 0) == (SimpleITK.GetArrayFromImage(labels) > 0)).all()
     inside = mesh.vertices - 1.5 * vertex_normals(mesh.vertices, mesh.faces)  # one voxel
@@ -43,22 +44,22 @@ def test_voxels_have_the_grid_of_the_label_image(exported):
     errors = np.array([found[i] for i in index]) - values  # mm to the left
     assert np.abs(errors).max() < 3.0  # two voxels: one inwards, one between centres and vertices
     assert abs(errors.mean()) < 0.5  # a grid that is shifted by one voxel has 1.5
-    np.testing.assert_allclose(nibabel.load(folder / "out" / "body.nii.gz").get_fdata(), numbers.T)
+    assert_allclose(nibabel.load(folder / "out" / "body.nii.gz").get_fdata(), numbers.T)
 
 
 def test_surfaces_are_in_ras(exported):
     folder, mesh, values = exported
     image = nibabel.load(folder / "out" / "body.gii")
     points, faces, shape = (array.data for array in image.darrays)
-    np.testing.assert_allclose(points, mesh.vertices, atol=1e-4)
-    np.testing.assert_array_equal(faces, mesh.faces)
-    np.testing.assert_allclose(shape, values, rtol=1e-6)
+    assert_allclose(points, mesh.vertices, atol=1e-4)
+    assert_array_equal(faces, mesh.faces)
+    assert_allclose(shape, values, rtol=1e-6)
     assert image.darrays[0].coordsys.dataspace == 1  # scanner
     ply = trimesh.load(folder / "out" / "body.ply", process=False)
-    np.testing.assert_allclose(ply.vertices, mesh.vertices)
-    np.testing.assert_array_equal(ply.faces, mesh.faces)
+    assert_allclose(ply.vertices, mesh.vertices)
+    assert_array_equal(ply.faces, mesh.faces)
     found = ply.metadata["_ply_raw"]["vertex"]["data"]["value"]
-    np.testing.assert_allclose(found, values, 1e-6)
+    assert_allclose(found, values, 1e-6)
     for name in ("body.ply", "body.vtk"):
         assert b"SPACE=RAS" in (folder / "out" / name).read_bytes()[:200]
 
@@ -73,11 +74,11 @@ def test_vtk_reads_the_surface_and_its_values(exported):
         reader.Update()
         surface = reader.GetOutput()
         points = vtk_to_numpy(surface.GetPoints().GetData())
-        np.testing.assert_allclose(points, mesh.vertices, atol=1e-4)
+        assert_allclose(points, mesh.vertices, atol=1e-4)
         assert surface.GetNumberOfPolys() == len(mesh.faces)
         if name == "vtk":
             found = vtk_to_numpy(surface.GetPointData().GetArray("value"))
-            np.testing.assert_allclose(found, values, rtol=1e-6)
+            assert_allclose(found, values, rtol=1e-6)
 
 
 def test_nothing_is_claimed_about_a_body_without_a_frame(tmp_path):

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 from pages import (
     DESCRIPTORS,
     EVIL,
@@ -27,6 +26,7 @@ from pages import (
     surfaces,
     worst_by_a_loop,
 )
+from trimesh.creation import icosphere
 
 from commands import run
 from conftest import as_mesh
@@ -66,7 +66,7 @@ def browser():
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A page of each kind of results."""
-    body = trimesh.creation.icosphere(subdivisions=3)
+    body = icosphere(subdivisions=3)
     body.vertices *= [1.0, 0.6 + 0.3 * (body.vertices[:, 2] > 0).mean(), 2.2]
     mesh = as_mesh(body)
     root = tmp_path_factory.mktemp("pages")
@@ -158,7 +158,7 @@ def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(browser
     )
     files = [{"file": name, "part": name[6:]} for name in names]
     (tmp_path / "meshes.json").write_text(json.dumps({"meshes": files}))
-    body = as_mesh(trimesh.creation.icosphere(subdivisions=2)).annotated(unit="mm")
+    body = as_mesh(icosphere(subdivisions=2)).annotated(unit="mm")
     one = next(iter(surfaces(body).values()))
     page = render_page(read_results(tmp_path), dict.fromkeys(names, one))
     (tmp_path / "page.html").write_text(page, encoding="utf-8")
@@ -824,7 +824,7 @@ def test_the_demo_ends_with_its_page(browser, tmp_path, monkeypatch, capsys):
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory):
     """A page of two organs of three scans in the frame of the patient, with a column of labels.csv."""
-    body = trimesh.creation.icosphere(subdivisions=3)
+    body = icosphere(subdivisions=3)
     mesh = as_mesh(body).annotated(frame="RAS", unit="mm")
     signature = compute_signature(mesh, SignatureConfig(n_eigenpairs=8, resolution=6))
     names = tuple(f"cohort_{i:02}.nii.gz#{part}" for part in ("1", "2") for i in range(3))

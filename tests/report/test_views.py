@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 from matplotlib.image import imread
+from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
 from conftest import as_mesh
@@ -31,8 +32,8 @@ def marked_ball(axes, toward):
     affine[:3, 3] = CENTRE - affine[:3, :3] @ [19.5, 19.5, 19.5]
     index = np.stack(np.indices((40, 40, 40)), axis=-1)
     world = index @ affine[:3, :3].T + affine[:3, 3]
-    ball = np.linalg.norm(world - CENTRE, axis=-1) < 15
-    knob = np.linalg.norm(world - CENTRE - 17 * np.array(toward), axis=-1) < 6
+    ball = norm(world - CENTRE, axis=-1) < 15
+    knob = norm(world - CENTRE - 17 * np.array(toward), axis=-1) < 6
     return (ball | knob).astype(np.uint8), affine
 
 
@@ -72,7 +73,7 @@ def test_a_mark_is_at_its_letter_in_every_view(tmp_path, orientation, ending, le
     path = tmp_path / f"body.{ending}"
     write(path, *marked_ball(ORIENTATIONS[orientation], MARKS[letter]))
     views, (vertices,) = common_views([load_mesh(path)])
-    farthest = vertices[np.linalg.norm(vertices - CENTRE, axis=1).argmax()]
+    farthest = vertices[norm(vertices - CENTRE, axis=1).argmax()]
     assert len(views) == 6
     assert {nearest_letter(view, farthest) for view in views} == {letter}
 
@@ -129,7 +130,7 @@ def test_bodies_without_a_frame_are_turned_onto_the_first_and_not_mirrored():
     for view in views:
         assert view.letters == ()
     np.testing.assert_allclose(moved, own, atol=0.02)
-    assert np.linalg.norm(other - own, axis=1).max() > 0.3
+    assert norm(other - own, axis=1).max() > 0.3
     motion = np.linalg.lstsq(mirrored.vertices - mirrored.vertices.mean(axis=0), other, rcond=None)
     assert np.linalg.det(motion[0]) > 0
 

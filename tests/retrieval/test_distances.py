@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.spatial.distance import cdist
 from sklearn.metrics.pairwise import additive_chi2_kernel
 from torch import Tensor
-from torch.autograd import forward_ad
+from torch.autograd import forward_ad, grad
+from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from conftest import torch_threads
@@ -48,7 +50,7 @@ def test_agrees_with_another_library(distance, dtype, tolerance, n_queries, n_ga
     assert result.shape == (n_queries, n_gallery)
     assert result.dtype == dtype
     found = result.double().numpy()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
+    assert_allclose(found, expected, rtol=0, atol=tolerance)
 
 
 @pytest.mark.usefixtures("either_device")
@@ -92,7 +94,7 @@ def test_threads_change_no_bit(distance, many_cores, monkeypatch):
     assert torch.equal(found[1], found[0])
     assert torch.equal(found[2], found[0])
     expected = ORACLES[distance](queries.numpy(), gallery.numpy())
-    np.testing.assert_allclose(found[0].numpy(), expected, rtol=0, atol=1e-12)
+    assert_allclose(found[0].numpy(), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.usefixtures("either_device")
@@ -105,7 +107,7 @@ def test_half_precision_is_computed_in_float32():
     queries = histograms(4, (5, 8), seed=4).half()
     for distance in ALL:
         expected = distance(queries.float(), queries[:2].float())
-        torch.testing.assert_close(distance(queries, queries[:2]), expected)
+        assert_close(distance(queries, queries[:2]), expected)
 
 
 @pytest.mark.usefixtures("either_device")
@@ -124,7 +126,7 @@ def test_cells_that_are_multiplied_in_both_weigh_so_much_in_chi_square():
                 weight = float(weights.broadcast_to(3, 8)[i, j])
                 expected[q, g] += 0.5 * weight * (a - b) ** 2 / (a + b)
         found = chi_square(weights * queries, weights * gallery)
-        np.testing.assert_allclose(found.numpy(), expected, atol=1e-14)
+        assert_allclose(found.numpy(), expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("distance", ALL)
@@ -144,7 +146,7 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(distance,
     along = histograms(len(both[side]), (40,), seed=29, filled=2)
     upstream = histograms(3, (2,), seed=30, filled=2)
     leaf = both[side].requires_grad_()
-    [gradient] = torch.autograd.grad((distance(*both) * upstream).sum(), leaf)
+    [gradient] = grad((distance(*both) * upstream).sum(), leaf)
     expected = (gradient * along).sum()
 
     def of_side(rows):
@@ -160,7 +162,7 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(distance,
         (torch.func.grad(of_side)(plain) * along).sum(),
     ]
     for one in found:
-        torch.testing.assert_close(one, expected, rtol=1e-9, atol=0)
+        assert_close(one, expected, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("distance", ALL)
@@ -171,7 +173,7 @@ def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_diffe
     gradient = torch.func.grad(lambda rows: distance(rows, gallery).square().sum())
     found = torch.func.jvp(gradient, (queries,), (along,))[1]
     expected = (gradient(queries + 1e-6 * along) - gradient(queries - 1e-6 * along)) / 2e-6
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+    assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula():
@@ -179,14 +181,12 @@ def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_form
     gallery = histograms(30, (9000,), seed=11, filled=2)
     upstream = torch.rand(40, 30, generator=torch.Generator().manual_seed(13), dtype=torch.float64)
     arguments = [tensor.requires_grad_() for tensor in (queries, gallery)]
-    gradients = torch.autograd.grad((chi_square(*arguments) * upstream).sum(), arguments)
+    gradients = grad((chi_square(*arguments) * upstream).sum(), arguments)
     a = queries[:, None]
     b = gallery[None]
     plain = ((a - b) ** 2 / (a + b)).sum(-1) / 2
-    for ours, expected in zip(
-        gradients, torch.autograd.grad((plain * upstream).sum(), arguments), strict=True
-    ):
-        torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-12)
+    for ours, expected in zip(gradients, grad((plain * upstream).sum(), arguments), strict=True):
+        assert_close(ours, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_chi_square_has_second_derivatives_and_none_at_empty_cells():
@@ -195,10 +195,8 @@ def test_chi_square_has_second_derivatives_and_none_at_empty_cells():
     leaves = [one.requires_grad_() for one in (queries, gallery)]
     assert torch.autograd.gradgradcheck(chi_square, leaves)
     empty = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
-    [first] = torch.autograd.grad(
-        chi_square(empty, torch.zeros(1, 2).double()).sum(), empty, create_graph=True
-    )
-    found = torch.autograd.grad(first.sum(), empty)[0].tolist()
+    [first] = grad(chi_square(empty, torch.zeros(1, 2).double()).sum(), empty, create_graph=True)
+    found = grad(first.sum(), empty)[0].tolist()
     assert found == [[0, 0]]
 
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from igps.retrieval import euclidean, rerank, rerank_candidates, retrieval_scores, search
 
@@ -53,7 +54,7 @@ def test_sets_and_sums_of_the_paper(k, n_expanded, share, points):
     distances = euclidean(points, points)
     expected = torch.tensor(by_hand(distances.tolist(), k, n_expanded, share), dtype=torch.float64)
     found = rerank(distances, k, n_expanded, share, keep_nearest=False)
-    torch.testing.assert_close(found, expected, atol=1e-10, rtol=0)
+    assert_close(found, expected, atol=1e-10, rtol=0)
 
 
 def test_a_shape_is_its_own_nearest_among_equals(points):
@@ -64,7 +65,7 @@ def test_a_shape_is_its_own_nearest_among_equals(points):
     for k in (3, 5):
         expected = torch.tensor(by_hand(distances.tolist(), k, 1, 0.3), dtype=torch.float64)
         found = rerank(distances, k, 1, 0.3, keep_nearest=False)
-        torch.testing.assert_close(found, expected, atol=1e-10, rtol=0)
+        assert_close(found, expected, atol=1e-10, rtol=0)
 
 
 @pytest.mark.parametrize(("n_copies", "dtype"), [(0, torch.float32), (8, torch.float64)])
@@ -76,7 +77,7 @@ def test_the_nearest_stays_the_nearest(n_copies, dtype):
     own = torch.minimum(own, own.T)
     found = rerank(own)
     moved = rerank(own, keep_nearest=False)
-    torch.testing.assert_close(found, found.T, rtol=0, atol=0)
+    assert_close(found, found.T, rtol=0, atol=0)
     alone = own.clone().fill_diagonal_(torch.inf)
     for i, row in enumerate(found.clone().fill_diagonal_(torch.inf)):
         assert alone[i, row.argmin()] == alone[i].min()
@@ -86,7 +87,7 @@ def test_the_nearest_stays_the_nearest(n_copies, dtype):
     if not n_copies:  # among equals, which is the nearest is not told
         rest = ~(nearest | nearest.T).fill_diagonal_(True)
         alone = rerank(own, keep_nearest=False)
-        torch.testing.assert_close(found[rest], alone[rest], rtol=0, atol=0)
+        assert_close(found[rest], alone[rest], rtol=0, atol=0)
         assert found[nearest].max() < found[rest].min()
 
 
@@ -94,9 +95,9 @@ def test_the_order_of_shapes_does_not_matter(points):
     order = torch.randperm(30, generator=torch.Generator().manual_seed(1))
     found = rerank(euclidean(points, points))
     shuffled = rerank(euclidean(points[order], points[order]))
-    torch.testing.assert_close(shuffled, found[order][:, order])
-    torch.testing.assert_close(found, found.T)
-    torch.testing.assert_close(rerank(3 * euclidean(points, points)), found)
+    assert_close(shuffled, found[order][:, order])
+    assert_close(found, found.T)
+    assert_close(rerank(3 * euclidean(points, points)), found)
 
 
 def test_classes_that_scatter_are_found_better():
@@ -121,9 +122,7 @@ def test_a_query_with_all_that_there_is_ranks_as_the_collection_does(points):
         together = torch.cat([query[None], gallery])
         expected = rerank(euclidean(together, together))[0, 1:]
         assert found.indices[i].tolist() == expected.argsort()[:5].tolist()
-        torch.testing.assert_close(
-            found.distances[i], expected.sort().values[:5], rtol=0, atol=1e-9
-        )
+        assert_close(found.distances[i], expected.sort().values[:5], rtol=0, atol=1e-9)
 
 
 def test_a_query_is_put_in_order_by_its_nearest_alone():

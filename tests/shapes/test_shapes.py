@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_array_equal
 from training.shapes.polygons import Prism
 
 from igps.shapes import ArticulatedShapes
@@ -81,8 +82,8 @@ def test_arrays_and_triangles_are_sane(all_shapes):
 def test_same_seed_same_arrays_other_seed_others(default_shapes):
     for i in (0, 4, 23):
         again = ArticulatedShapes(n_per_class=3)[i]
-        np.testing.assert_array_equal(again.vertices, default_shapes[i].vertices)
-        np.testing.assert_array_equal(again.faces, default_shapes[i].faces)
+        assert_array_equal(again.vertices, default_shapes[i].vertices)
+        assert_array_equal(again.faces, default_shapes[i].faces)
     other = ArticulatedShapes(n_per_class=3, seed=1)[0]
     assert not np.array_equal(other.vertices, default_shapes[0].vertices)
 
@@ -92,8 +93,8 @@ def test_a_shape_does_not_depend_on_the_others(all_shapes):
     alone = ArticulatedShapes(n_classes=11, n_per_class=4, seed=3)[10 * 4]
     among = all_shapes[24 + 2]
     assert alone.name == among.name
-    np.testing.assert_array_equal(alone.vertices, among.vertices)
-    np.testing.assert_array_equal(alone.faces, among.faces)
+    assert_array_equal(alone.vertices, among.vertices)
+    assert_array_equal(alone.faces, among.faces)
 
 
 def test_shapes_of_a_class_differ(default_shapes):
@@ -158,8 +159,8 @@ def test_write_gives_the_same_meshes_and_resumes(tmp_path):
     names = [file.relative_to(tmp_path).as_posix() for file in files]
     assert names == [f"{name}.off" for name in shapes.names]
     read = trimesh.load(files[3], process=False)
-    np.testing.assert_array_equal(read.vertices, shapes[3].vertices)
-    np.testing.assert_array_equal(read.faces, shapes[3].faces)
+    assert_array_equal(read.vertices, shapes[3].vertices)
+    assert_array_equal(read.faces, shapes[3].faces)
 
     before = [file.read_bytes() for file in files]
     times = [file.stat().st_mtime_ns for file in files]

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import trimesh
+from numpy.testing import assert_allclose
 
 from igps.mesh.mesh import Mesh
 from igps.signature.attributes import (
@@ -29,13 +30,13 @@ def points():
 
 def test_depth_in_a_box_is_to_the_nearest_wall(box, points):
     expected = (np.array([0.5, 1.0, 1.5]) - np.abs(points)).min(axis=1) / np.sqrt(22)
-    np.testing.assert_allclose(depth(box, points), expected, atol=1e-12)
+    assert_allclose(depth(box, points), expected, atol=1e-12)
 
 
 def test_direction_in_a_box_is_the_normal_of_the_nearest_wall(box, points):
     gap = np.array([0.5, 1.0, 1.5]) - np.abs(points)
     expected = np.sign(points) * (gap == gap.min(axis=1, keepdims=True))
-    np.testing.assert_allclose(surface_direction(box, points), expected, atol=1e-12)
+    assert_allclose(surface_direction(box, points), expected, atol=1e-12)
 
 
 def test_direction_on_the_surface_is_the_outward_normal(sphere):
@@ -44,16 +45,14 @@ def test_direction_on_the_surface_is_the_outward_normal(sphere):
     normals = surface_attributes(sphere, faces, ("depth", "surface_direction"))
     assert list(normals) == ["surface_direction"]  # the depth of the surface is 0 everywhere
     expected = centres / np.linalg.norm(centres, axis=1, keepdims=True)
-    np.testing.assert_allclose(normals["surface_direction"], expected, atol=0.02)
+    assert_allclose(normals["surface_direction"], expected, atol=0.02)
     assert surface_attributes(sphere, faces, ("depth",)) == {}
 
 
 def test_potential_in_a_charged_ball_is_constant(sphere):
     points = np.random.default_rng(1).normal(size=(30, 3))
     points *= np.linspace(0, 0.9, 30)[:, None] / np.linalg.norm(points, axis=1)[:, None]
-    np.testing.assert_allclose(
-        electrostatic_potential(sphere, points), np.sqrt(4 * np.pi), rtol=2e-3
-    )
+    assert_allclose(electrostatic_potential(sphere, points), np.sqrt(4 * np.pi), rtol=2e-3)
 
 
 def test_potential_in_a_box_is_the_surface_integral(box):
@@ -75,15 +74,13 @@ def test_potential_in_a_box_is_the_surface_integral(box):
             )
             total += value
     finer = Mesh(*trimesh.remesh.subdivide(box.vertices, box.faces))
-    np.testing.assert_allclose(
-        electrostatic_potential(finer, point[None]), total / np.sqrt(22), rtol=1e-3
-    )
+    assert_allclose(electrostatic_potential(finer, point[None]), total / np.sqrt(22), rtol=1e-3)
 
 
 def test_potential_stays_finite_on_a_vertex(sphere):
     value = electrostatic_potential(sphere, sphere.vertices[:1])
     expected = np.sqrt(4 * np.pi)
-    np.testing.assert_allclose(value, expected, rtol=2e-3)
+    assert_allclose(value, expected, rtol=2e-3)
 
 
 def test_attributes_do_not_change_with_scale_or_place(box, points):
@@ -94,7 +91,7 @@ def test_attributes_do_not_change_with_scale_or_place(box, points):
         for m, p in ((box, points), (moved, points * 7 + [100.0, 0, 5]))
     )
     for name in names:
-        np.testing.assert_allclose(here[name], there[name], rtol=1e-5, atol=1e-6)
+        assert_allclose(here[name], there[name], rtol=1e-5, atol=1e-6)
         assert here[name].dtype == np.float32
 
 

@@ -6,6 +6,8 @@ import logging
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
@@ -65,19 +67,19 @@ def test_approximation_tends_to_the_exact_result():
 def test_surface_points_are_interpolated_also_where_most_of_the_surface_is_far():
     vertices, faces = bumpy_sphere(4)
     functions = smooth_functions(vertices)
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     chosen = rng.integers(len(faces), size=60)
     barycentric = rng.dirichlet(np.ones(3), size=60)
     points = np.einsum("pi,pix->px", barycentric, vertices[faces[chosen]])
     expected = np.einsum("pi,pik->pk", barycentric, functions[faces[chosen]])
     result = extend(vertices, faces, functions, points, accuracy=1e-2, dtype=np.float64)
-    np.testing.assert_allclose(result, expected, atol=1e-12)
+    assert_allclose(result, expected, atol=1e-12)
 
 
 def test_clusters_turn_with_the_mesh():
     vertices, faces = bumpy_sphere(4)
     # No mirror symmetry, no ties
-    vertices = vertices + 1e-3 * np.random.default_rng(0).normal(size=vertices.shape)
+    vertices = vertices + 1e-3 * default_rng(0).normal(size=vertices.shape)
     points = interior_points((vertices, faces), 400)
     functions = smooth_functions(vertices)
     rotation = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix().T
@@ -87,7 +89,7 @@ def test_clusters_turn_with_the_mesh():
         )
         for accuracy, turn in ((None, np.eye(3)), (1e-3, np.eye(3)), (1e-3, rotation))
     )
-    np.testing.assert_allclose(turned, still, atol=1e-9)
+    assert_allclose(turned, still, atol=1e-9)
     assert np.abs(still - exact).max() > 1e-5
 
 
@@ -102,18 +104,18 @@ def test_approximation_reproduces_positions():
 @pytest.mark.parametrize("size", [1, 8])
 def test_spatial_order_cuts_a_grid_into_cubes(size):
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), -1).reshape(-1, 3)
-    points = np.random.default_rng(0).permutation(grid)
+    points = default_rng(0).permutation(grid)
     order = spatial_order(points, size)
-    np.testing.assert_array_equal(np.sort(order), np.arange(512))
+    assert_array_equal(np.sort(order), np.arange(512))
     for run, side in ((8, 1), (64, 3)):
         assert (np.ptp(points[order].reshape(-1, run, 3), axis=1) == side).all()
 
 
 @pytest.mark.parametrize("n", [0, 7, 83])
 def test_spatial_order_is_one_for_any_number(n):
-    points = np.random.default_rng(n).normal(size=(n, 3))
+    points = default_rng(n).normal(size=(n, 3))
     order = spatial_order(points, 8)
-    np.testing.assert_array_equal(np.sort(order), np.arange(n))
+    assert_array_equal(np.sort(order), np.arange(n))
 
 
 def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(monkeypatch, caplog):
@@ -150,5 +152,5 @@ def test_where_no_approximation_serves_the_closed_form_does(monkeypatch):
     monkeypatch.setattr(Extension, "_sampled_error", never)
     found = extend(*mesh, functions, points, accuracy=1e-3, dtype=np.float64)
     expected = extend(*mesh, functions, points)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert_allclose(found, expected, atol=1e-12)
     assert settings

@@ -5,6 +5,9 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from bodies import (
@@ -25,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("approximate_small_meshes")
 def published_loop(vertices, faces, point):
     """Weights of one point, as Ju, Schaefer and Warren 2005, figure 4, writes them down."""
     eps = 1e-9
-    distances = np.linalg.norm(vertices - point, axis=1)
+    distances = norm(vertices - point, axis=1)
     if distances.min() < eps:
         return np.eye(len(vertices))[distances.argmin()]
     units = (vertices - point) / distances[:, None]
@@ -33,7 +36,7 @@ def published_loop(vertices, faces, point):
     for face in faces:
         u = units[face]
         d = distances[face]
-        lengths = [np.linalg.norm(u[(i + 1) % 3] - u[(i + 2) % 3]) for i in range(3)]
+        lengths = [norm(u[(i + 1) % 3] - u[(i + 2) % 3]) for i in range(3)]
         theta = [2 * math.asin(min(1.0, length / 2)) for length in lengths]
         h = sum(theta) / 2
         if math.pi - h < eps:  # on the face
@@ -64,26 +67,26 @@ def published_loop(vertices, faces, point):
 def test_weights_sum_to_one_and_reproduce_linear_functions(mesh, sample):
     points = sample(mesh, 60)
     weights = mean_value_coordinates(*mesh, points)
-    np.testing.assert_allclose(weights.sum(1), 1, atol=1e-12)
-    np.testing.assert_allclose(weights @ mesh[0], points, atol=1e-9)
+    assert_allclose(weights.sum(1), 1, atol=1e-12)
+    assert_allclose(weights @ mesh[0], points, atol=1e-9)
 
 
 @pytest.mark.parametrize("mesh", [bumpy_sphere(1), cube()], ids=["bumpy", "cube"])
 def test_weights_equal_the_published_loop(mesh):
     points = np.concatenate([interior_points(mesh, 15), exterior_points(mesh, 15)])
     expected = np.stack([published_loop(*mesh, point) for point in points])
-    np.testing.assert_allclose(mean_value_coordinates(*mesh, points), expected, atol=1e-9)
+    assert_allclose(mean_value_coordinates(*mesh, points), expected, atol=1e-9)
 
 
 def test_centre_of_a_regular_solid_weighs_all_vertices_alike():
     icosahedron = trimesh.creation.icosahedron()
     weights = mean_value_coordinates(icosahedron.vertices, icosahedron.faces, np.zeros((1, 3)))
-    np.testing.assert_allclose(weights, 1 / 12, atol=1e-14)
+    assert_allclose(weights, 1 / 12, atol=1e-14)
 
 
 def test_surface_points_are_interpolated_in_their_triangle():
     vertices, faces = bumpy_sphere(2)
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     chosen = rng.integers(len(faces), size=30)
     barycentric = rng.dirichlet(np.ones(3), size=30)
     barycentric[10:20, 0] = 0  # on an edge
@@ -93,25 +96,25 @@ def test_surface_points_are_interpolated_in_their_triangle():
     np.put_along_axis(expected, faces[chosen], barycentric, axis=1)
     points = np.einsum("pi,pix->px", barycentric, vertices[faces[chosen]])
     found = mean_value_coordinates(vertices, faces, points)
-    np.testing.assert_allclose(found, expected, atol=1e-7)
+    assert_allclose(found, expected, atol=1e-7)
 
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-7, 1e-9, 1e-12])
 def test_weights_are_continuous_towards_faces_edges_and_vertices(distance):
     vertices, faces = bumpy_sphere(2)
     functions = smooth_functions(vertices)
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     chosen = rng.integers(len(faces), size=60)
     barycentric = rng.dirichlet(np.ones(3), size=60)
     barycentric[20:40, 0] = 0
     barycentric[40:] = np.eye(3)[rng.integers(3, size=20)]
     barycentric /= barycentric.sum(1, keepdims=True)
     directions = rng.normal(size=(60, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions /= norm(directions, axis=1, keepdims=True)
     points = np.einsum("pi,pix->px", barycentric, vertices[faces[chosen]]) + distance * directions
     limit = np.einsum("pi,pik->pk", barycentric, functions[faces[chosen]])
     found = extend(vertices, faces, functions, points)
-    np.testing.assert_allclose(found, limit, atol=60 * distance + 1e-7)
+    assert_allclose(found, limit, atol=60 * distance + 1e-7)
     assert np.abs(extend(vertices, faces, vertices, points) - points).max() < 1e-7
 
 
@@ -128,9 +131,9 @@ def test_points_in_the_planes_of_faces_are_exact(subdivisions, offset):
     vertices = box.vertices @ turn
     points = grid @ turn
     weights = mean_value_coordinates(vertices, box.faces, points)
-    np.testing.assert_allclose(weights @ vertices, points, atol=1e-7)
+    assert_allclose(weights @ vertices, points, atol=1e-7)
     straight = mean_value_coordinates(box.vertices, box.faces, grid)
-    np.testing.assert_allclose(straight @ box.vertices, grid, atol=1e-7)
+    assert_allclose(straight @ box.vertices, grid, atol=1e-7)
 
 
 @pytest.mark.parametrize("accuracy", [None, 1e-2])
@@ -143,7 +146,7 @@ def test_similarities_do_not_change_the_result(accuracy):
     for scale, shift, tolerance in ((1e-6, 0.0, 1e-9), (1e6, 0.0, 1e-9), (1.0, 1e4, 1e-7)):
         moved, moved_points = (scale * array @ rotation.T + shift for array in (vertices, points))
         result = extend(moved, faces, functions, moved_points, accuracy=accuracy, dtype=np.float64)
-        np.testing.assert_allclose(result, expected, atol=tolerance)
+        assert_allclose(result, expected, atol=tolerance)
 
 
 def test_orientation_and_order_do_not_matter():
@@ -151,11 +154,11 @@ def test_orientation_and_order_do_not_matter():
     points = interior_points((vertices, faces), 30)
     expected = mean_value_coordinates(vertices, faces, points)
     turned = mean_value_coordinates(vertices, faces[:, ::-1], points)
-    np.testing.assert_allclose(turned, expected, atol=1e-12)
-    shuffled = np.random.default_rng(0).permutation(faces)
+    assert_allclose(turned, expected, atol=1e-12)
+    shuffled = default_rng(0).permutation(faces)
     rolled = np.roll(shuffled, 1, axis=1)
     backwards = mean_value_coordinates(vertices, rolled, points[::-1])
-    np.testing.assert_allclose(backwards[::-1], expected, atol=1e-12)
+    assert_allclose(backwards[::-1], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("accuracy", [None, 7e-3])
@@ -169,7 +172,7 @@ def test_flat_faces_and_loose_vertices_contribute_nothing(accuracy):
     flat = np.array([[0, 0, 1], [5, n, 7], [3, 3, 3], [n + 1, n + 1, 2]])
     values = np.concatenate([functions, np.full((3, functions.shape[1]), 100.0)])
     result = extend(more, np.concatenate([faces, flat]), values, points, accuracy=accuracy)
-    np.testing.assert_allclose(result, expected, atol=1e-12 if accuracy is None else 1e-5)
+    assert_allclose(result, expected, atol=1e-12 if accuracy is None else 1e-5)
 
 
 @pytest.mark.parametrize(("accuracy", "tolerance"), [(None, 1e-12), (7e-3, 1e-11)])
@@ -180,7 +183,7 @@ def test_pieces_do_not_change_the_result(accuracy, tolerance, monkeypatch):
     whole = extend(vertices, faces, functions, points, accuracy=accuracy, dtype=np.float64)
     monkeypatch.setattr(coordinates, "_BLOCK_BYTES", 3 * 8 * len(vertices))
     limited = extend(vertices, faces, functions, points, accuracy=accuracy, dtype=np.float64)
-    np.testing.assert_allclose(limited, whole, atol=tolerance)
+    assert_allclose(limited, whole, atol=tolerance)
 
 
 @pytest.mark.parametrize("accuracy", [None, 1e-2])
@@ -192,7 +195,7 @@ def test_single_precision_agrees_with_double(accuracy):
         extend(*mesh, functions, points, accuracy=accuracy, dtype=dtype)
         for dtype in (np.float32, np.float64)
     )
-    np.testing.assert_allclose(single, double, atol=1e-5)
+    assert_allclose(single, double, atol=1e-5)
     assert not np.array_equal(single, double)
 
 
@@ -222,7 +225,7 @@ def test_read_only_and_single_precision_input_is_accepted_and_kept():
     for array in arrays:
         array.setflags(write=False)
     found = extend(*arrays, accuracy=1e-2)
-    np.testing.assert_allclose(found, 1, atol=1e-6)
+    assert_allclose(found, 1, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -267,7 +270,7 @@ def test_invalid_arguments_are_named(change, message):
 @pytest.mark.parametrize("accuracy", [None, 1e-3])
 def test_functions_are_divided_on_the_way(accuracy):
     mesh = bumpy_sphere(3)
-    generator = np.random.default_rng(5)
+    generator = default_rng(5)
     functions = generator.standard_normal((len(mesh[0]), 4))
     points = generator.uniform(-0.4, 0.4, (30, 3))
     divisors = np.array([0.5, 1.0, 3.0, 7.0])

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -29,7 +31,7 @@ CONFIG = SignatureConfig(n_eigenpairs=40, resolution=16, min_samples=0, n_surfac
 
 
 def renumbered(mesh, seed=5):
-    generator = np.random.default_rng(seed)
+    generator = default_rng(seed)
     order = generator.permutation(len(mesh.vertices))
     faces = np.argsort(order)[mesh.faces][generator.permutation(len(mesh.faces))]
     shifts = generator.integers(0, 3, len(faces))
@@ -38,7 +40,7 @@ def renumbered(mesh, seed=5):
 
 
 def spectrum_of(n_points):
-    generator = np.random.default_rng(2)
+    generator = default_rng(2)
     return generator.normal(size=(n_points, 30)), np.sort(generator.uniform(5, 300, 30))
 
 
@@ -46,20 +48,20 @@ def test_places_go_with_the_points_and_leave_signs_and_bases_alone():
     functions, eigenvalues = spectrum_of(500)
     eigenvalues[7:10] = eigenvalues[7]  # a multiplet, of which any basis may come
     expected = ordering_keys(functions, eigenvalues, 1.0)
-    order = np.random.default_rng(0).permutation(500)
+    order = default_rng(0).permutation(500)
     found = ordering_keys(functions[order], eigenvalues, 1.0)
-    np.testing.assert_allclose(found, expected[order], rtol=1e-12)
+    assert_allclose(found, expected[order], rtol=1e-12)
     signs = np.where(np.arange(30) % 2, -1, 1)
     found = ordering_keys(functions * signs, eigenvalues, 1.0)
-    np.testing.assert_allclose(found, expected)
-    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    assert_allclose(found, expected)
+    turn = np.linalg.qr(default_rng(1).normal(size=(3, 3)))[0]
     turned = functions.copy()
     turned[:, 7:10] = functions[:, 7:10] @ turn
     found = ordering_keys(turned, eigenvalues, 1.0)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert_allclose(found, expected, rtol=1e-12)
     # Three times as large
     found = ordering_keys(functions / 3, eigenvalues / 9, 9.0)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert_allclose(found, expected, rtol=1e-12)
 
 
 def test_points_of_one_potential_have_different_places():
@@ -71,24 +73,24 @@ def test_points_of_one_potential_have_different_places():
     assert np.diff(np.sort(found)).min() > 1e-9
     exchanged = ordering_keys(np.concatenate([functions * mirror, functions]), eigenvalues, 1.0)
     expected = np.sort(found)
-    np.testing.assert_allclose(np.sort(exchanged), expected, rtol=1e-9)
+    assert_allclose(np.sort(exchanged), expected, rtol=1e-9)
 
 
 def test_spacings_and_area_shares_by_hand():
     line = np.zeros((9, 3))
     line[:, 0] = np.arange(9)
     expected = np.abs(line[:, 0] - line[:, :1]).mean(axis=1)  # all are nearest
-    np.testing.assert_allclose(nearest_spacing(line), expected / expected.mean())
+    assert_allclose(nearest_spacing(line), expected / expected.mean())
     areas = np.array([1.0, 2.0, 4.0])
     shares = vertex_area_shares(np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]), areas)
-    np.testing.assert_allclose(shares * 21 / 4, [3, 5, 7, 6])
+    assert_allclose(shares * 21 / 4, [3, 5, 7, 6])
 
 
 def test_systematic_samples_follow_the_sizes():
-    sizes = np.random.default_rng(0).random(50) ** 3
+    sizes = default_rng(0).random(50) ** 3
     sizes[[0, 20, 49]] = 0
     ends = np.cumsum(sizes)
-    drawn = systematic_sample(sizes, 400, np.random.default_rng(1))
+    drawn = systematic_sample(sizes, 400, default_rng(1))
     assert (np.diff(drawn) >= 0).all()
     assert not set(drawn) & {0, 20, 49}
     counts = np.bincount(drawn, minlength=50)
@@ -96,10 +98,10 @@ def test_systematic_samples_follow_the_sizes():
     assert np.abs(counts - 400 * sizes / ends[-1]).max() < 2
     many = np.zeros(50)
     for seed in range(3000):
-        few = systematic_sample(sizes, 7, np.random.default_rng(seed))
+        few = systematic_sample(sizes, 7, default_rng(seed))
         many += np.bincount(few, minlength=50)
     expected = sizes / ends[-1]
-    np.testing.assert_allclose(many / 21000, expected, atol=0.004)
+    assert_allclose(many / 21000, expected, atol=0.004)
 
 
 def bodies():
@@ -195,8 +197,8 @@ def test_the_order_of_form_takes_out_every_numbering(blob):
     expected = in_canonical_order(blob)
     for seed in range(3):
         found = in_canonical_order(renumbered(blob, seed))
-        np.testing.assert_array_equal(found.vertices, expected.vertices)
-        np.testing.assert_array_equal(found.faces, expected.faces)
+        assert_array_equal(found.vertices, expected.vertices)
+        assert_array_equal(found.faces, expected.faces)
 
 
 def test_the_order_of_form_keeps_the_surface(blob):
@@ -216,7 +218,5 @@ def test_the_order_of_form_does_not_depend_on_place_and_scale(blob):
     moved = replace(blob, vertices=2.5 * blob.vertices @ turn.T + [3, -1, 2])
     expected = in_canonical_order(blob)
     found = in_canonical_order(moved)
-    np.testing.assert_array_equal(found.faces, expected.faces)
-    np.testing.assert_allclose(
-        found.vertices, 2.5 * expected.vertices @ turn.T + [3, -1, 2], atol=1e-12
-    )
+    assert_array_equal(found.faces, expected.faces)
+    assert_allclose(found.vertices, 2.5 * expected.vertices @ turn.T + [3, -1, 2], atol=1e-12)

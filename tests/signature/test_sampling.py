@@ -1,6 +1,7 @@
 """Random points of a surface: evenly distributed, reproducible, and interpolated linearly."""
 
 import numpy as np
+from numpy.testing import assert_allclose
 from scipy.stats import chisquare, kstest
 
 from conftest import FACES, TETRAHEDRON
@@ -21,7 +22,7 @@ def test_points_are_even_within_a_face():
     """Each barycentric coordinate w of an even distribution has P(w < x) = 1 − (1 − x)²."""
     weights = surface_points(Mesh(TETRAHEDRON, FACES), 20_000, seed=1).weights
     assert weights.min() >= 0
-    np.testing.assert_allclose(weights.sum(axis=1), 1)
+    assert_allclose(weights.sum(axis=1), 1)
     for coordinate in weights.T:
         assert kstest(coordinate, lambda x: 1 - (1 - x) ** 2).pvalue > 0.01
 
@@ -29,14 +30,12 @@ def test_points_are_even_within_a_face():
 def test_linear_functions_are_interpolated_exactly(blob):
     points = surface_points(blob, 500, seed=2)
     slopes = np.random.default_rng(0).normal(size=(3, 4))
-    np.testing.assert_allclose(
+    assert_allclose(
         points.interpolate(blob.vertices @ slopes), points.positions @ slopes, atol=1e-12
     )
     corners = blob.vertices[blob.faces[points.face]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    np.testing.assert_allclose(
-        np.einsum("ij,ij->i", points.positions - corners[:, 0], normals), 0, atol=1e-12
-    )
+    assert_allclose(np.einsum("ij,ij->i", points.positions - corners[:, 0], normals), 0, atol=1e-12)
 
 
 def test_the_seed_alone_decides(blob):

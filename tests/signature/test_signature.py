@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 
 from bodies import mean_value_coordinates
 from conftest import as_mesh
@@ -39,7 +40,7 @@ def test_another_default_device_changes_nothing(signature):
     with torch.device("meta"):  # whose tensors have no numbers to go on with
         found = compute_signature(mesh, CONFIG)
         batch = collate([signature, found])[np.array([False, True])]
-    np.testing.assert_array_equal(found.interior.eigenfunctions, expected.interior.eigenfunctions)
+    assert_array_equal(found.interior.eigenfunctions, expected.interior.eigenfunctions)
     assert torch.equal(batch.eigenvalues, collate([expected]).eigenvalues)
 
 
@@ -69,39 +70,35 @@ def test_distance_and_potential_equal_the_papers_gram_form(blob, signature):
 
     eigenfunctions = torch.from_numpy(signature.interior.eigenfunctions[::9]).double()
     embedding = spectral_embedding(eigenfunctions, torch.from_numpy(signature.eigenvalues))
-    np.testing.assert_allclose(interior_distance(embedding, embedding), distance, atol=1e-6)
-    np.testing.assert_allclose(barycentroid_potential(embedding), potential, rtol=1e-5)
+    assert_allclose(interior_distance(embedding, embedding), distance, atol=1e-6)
+    assert_allclose(barycentroid_potential(embedding), potential, rtol=1e-5)
 
 
 def test_barycentroid_of_a_ball_is_its_centre_and_of_a_body_its_least_potential(sphere, signature):
     ball = compute_signature(sphere, replace(CONFIG, resolution=11))
-    np.testing.assert_allclose(ball.barycentroid, 0, atol=1e-9)
+    assert_allclose(ball.barycentroid, 0, atol=1e-9)
     embedding = spectral_embedding(
         torch.from_numpy(signature.interior.eigenfunctions),
         torch.from_numpy(signature.eigenvalues),
     )
     least = int(barycentroid_potential(embedding).argmin())
-    np.testing.assert_array_equal(signature.barycentroid, signature.interior.points[least])
+    assert_array_equal(signature.barycentroid, signature.interior.points[least])
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_scale_does_not_matter(blob, signature, scale):
     scaled = compute_signature(Mesh(blob.vertices * scale, blob.faces), CONFIG)
     found = scaled.eigenvalues * scale**2
-    np.testing.assert_allclose(found, signature.eigenvalues, rtol=1e-7)
+    assert_allclose(found, signature.eigenvalues, rtol=1e-7)
     for samples in ("interior", "surface"):
-        np.testing.assert_allclose(
-            histogram(scaled, samples), histogram(signature, samples), atol=1e-5
-        )
+        assert_allclose(histogram(scaled, samples), histogram(signature, samples), atol=1e-5)
 
 
 def test_grid_symmetries_and_shifts_do_not_matter(blob, signature):
     turn = np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], dtype=float)
     moved = compute_signature(Mesh(blob.vertices @ turn.T + [10, -200, 3], blob.faces), CONFIG)
     for samples in ("interior", "surface"):
-        np.testing.assert_allclose(
-            histogram(moved, samples), histogram(signature, samples), atol=1e-5
-        )
+        assert_allclose(histogram(moved, samples), histogram(signature, samples), atol=1e-5)
 
 
 def test_signs_of_eigenfunctions_do_not_matter(signature):
@@ -112,9 +109,7 @@ def test_signs_of_eigenfunctions_do_not_matter(signature):
         surface=Samples(signature.surface.points, signature.surface.eigenfunctions * signs),
     )
     for samples in ("interior", "surface"):
-        np.testing.assert_allclose(
-            histogram(flipped, samples), histogram(signature, samples), atol=1e-6
-        )
+        assert_allclose(histogram(flipped, samples), histogram(signature, samples), atol=1e-6)
 
 
 def test_surface_samples_lie_on_the_surface_and_follow_its_area():
@@ -127,7 +122,7 @@ def test_surface_samples_lie_on_the_surface_and_follow_its_area():
     assert on_face.any(axis=1).all()
     share = on_face[on_face.sum(axis=1) == 1].mean(axis=0)
     expected = np.array([6, 3, 2]) / 11
-    np.testing.assert_allclose(share, expected, atol=0.012)
+    assert_allclose(share, expected, atol=0.012)
 
 
 def test_surface_values_are_interpolated_linearly(blob, signature):
@@ -138,7 +133,7 @@ def test_surface_values_are_interpolated_linearly(blob, signature):
     weights = trimesh.triangles.points_to_barycentric(surface.triangles[face], closest)
     expected = np.einsum("pi,pik->pk", weights, spectrum.eigenfunctions[surface.faces[face]])
     found = signature.surface.eigenfunctions[:20]
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert_allclose(found, expected, atol=1e-4)
 
 
 def test_simplified_mesh_gives_a_near_descriptor(sphere):
@@ -153,12 +148,10 @@ def test_simplified_mesh_gives_a_near_descriptor(sphere):
 def test_robust_backend_and_seed_are_honoured(blob, signature):
     robust = compute_signature(blob, replace(CONFIG, backend="robust"))
     assert not np.array_equal(robust.eigenvalues, signature.eigenvalues)
-    np.testing.assert_allclose(robust.eigenvalues, signature.eigenvalues, rtol=0.05)
+    assert_allclose(robust.eigenvalues, signature.eigenvalues, rtol=0.05)
     other = compute_signature(blob, replace(CONFIG, seed=1))
     assert not np.array_equal(other.surface.points, signature.surface.points)
-    np.testing.assert_array_equal(
-        compute_signature(blob, CONFIG).surface.points, signature.surface.points
-    )
+    assert_array_equal(compute_signature(blob, CONFIG).surface.points, signature.surface.points)
 
 
 @pytest.fixture(scope="module")
@@ -188,8 +181,8 @@ def test_other_matrices_serve_where_the_cotangent_ones_fail(needles, monkeypatch
     assert f"relative residual above {limit:.1e}" in note
     assert signature.residual < limit
     robust = compute_signature(needles, replace(CONFIG, backend="robust"))
-    np.testing.assert_array_equal(signature.eigenvalues, robust.eigenvalues)
-    np.testing.assert_array_equal(signature.interior.eigenfunctions, robust.interior.eigenfunctions)
+    assert_array_equal(signature.eigenvalues, robust.eigenvalues)
+    assert_array_equal(signature.interior.eigenfunctions, robust.interior.eigenfunctions)
 
 
 def test_a_mesh_that_no_matrices_serve_is_refused(needles, monkeypatch):
@@ -204,7 +197,7 @@ def test_a_mesh_that_no_matrices_serve_is_refused(needles, monkeypatch):
 def test_a_trimesh_has_the_signature_of_its_mesh(blob, signature):
     surface = trimesh.Trimesh(blob.vertices, blob.faces, process=False)
     found = compute_signature(surface, CONFIG)
-    np.testing.assert_array_equal(found.interior.eigenfunctions, signature.interior.eigenfunctions)
+    assert_array_equal(found.interior.eigenfunctions, signature.interior.eigenfunctions)
     with pytest.raises(
         TypeError, match=r"expected a Mesh, a trimesh\.Trimesh, .* got builtins\.str"
     ):
@@ -219,8 +212,8 @@ def test_attributes_are_added_to_samples_and_nothing_else_changes(signature):
     more = more.with_attributes({"height": 2 * height})
     found = {values.dtype.name for values in more.attributes.values()}
     assert found == {"float32"}
-    np.testing.assert_allclose(more.attributes["height"], 2 * height, rtol=1e-6)
-    np.testing.assert_allclose(more.attributes["away"], away, rtol=1e-6)
+    assert_allclose(more.attributes["height"], 2 * height, rtol=1e-6)
+    assert_allclose(more.attributes["away"], away, rtol=1e-6)
     assert more.eigenfunctions is samples.eigenfunctions
     assert samples.attributes == {}
     wrong = height.copy()
@@ -270,12 +263,12 @@ def test_a_signature_is_the_beginning_of_one_with_more(blob):
     assert whole.area == alone.area
     assert whole.volume == alone.volume
     assert whole.notes == alone.notes
-    np.testing.assert_allclose(whole.eigenvalues[:64], alone.eigenvalues, rtol=1e-9)
+    assert_allclose(whole.eigenvalues[:64], alone.eigenvalues, rtol=1e-9)
     for one, other in ((whole.interior, alone.interior), (whole.surface, alone.surface)):
         first = one.eigenfunctions[:, :64]
-        np.testing.assert_allclose(one.points, other.points, atol=1e-12)
+        assert_allclose(one.points, other.points, atol=1e-12)
         signs = np.sign((first * other.eigenfunctions).sum(axis=0))
-        np.testing.assert_allclose(first * signs, other.eigenfunctions, atol=1e-4)
+        assert_allclose(first * signs, other.eigenfunctions, atol=1e-4)
 
 
 def test_no_number_of_eigenpairs_is_the_usual_one(blob):
@@ -306,7 +299,7 @@ def test_real_model(homer):
     signature = compute_signature(homer, SignatureConfig.paper())
     assert histogram(signature).sum() == pytest.approx(1)
     exact = compute_signature(homer, replace(SignatureConfig.paper(), accuracy=None))
-    np.testing.assert_allclose(histogram(signature), histogram(exact), atol=2e-4)
+    assert_allclose(histogram(signature), histogram(exact), atol=2e-4)
     # The barycentroid of a standing figure lies in its trunk: between a third and two thirds of its height.
     low = homer.vertices.min(axis=0)
     high = homer.vertices.max(axis=0)

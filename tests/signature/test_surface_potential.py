@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 import scipy.integrate
 import trimesh
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 
 from igps.signature.surface_potential import surface_potential
 
@@ -12,12 +15,12 @@ def by_quadrature(triangle, point):
     """∫ dS/r in polar coordinates about the point's projection, where nothing is singular."""
     a, b, c = triangle
     normal = np.cross(b - a, c - a)
-    normal /= np.linalg.norm(normal)
+    normal /= norm(normal)
     height = (a - point) @ normal
     foot = point + height * normal
     total = 0.0
     for p, q in ((a, b), (b, c), (c, a)):
-        along = (q - p) / np.linalg.norm(q - p)
+        along = (q - p) / norm(q - p)
         # Of the side's line from the foot, positive inside
         distance = np.cross(along, normal) @ (p - foot)
         if abs(distance) < 1e-14:
@@ -35,7 +38,7 @@ def by_quadrature(triangle, point):
 
 
 def triangle_of(kind):
-    generator = np.random.default_rng(3)
+    generator = default_rng(3)
     if kind == "any":
         return generator.normal(size=(3, 3))
     if kind == "obtuse":
@@ -48,16 +51,16 @@ def triangle_of(kind):
 def test_triangle_equals_quadrature(kind, height):
     triangle = triangle_of(kind)
     normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
-    normal /= np.linalg.norm(normal)
+    normal /= norm(normal)
     weights = np.array(
         [[0.2, 0.3, 0.5], [0.9, 0.05, 0.05], [1.4, -0.2, -0.2], [-0.6, 0.9, 0.7], [2.5, -3.0, 1.5]]
     )
     points = weights @ triangle + height * normal
     expected = [by_quadrature(triangle, point) for point in points]
     result = surface_potential(triangle, np.array([[0, 1, 2]]), points)
-    np.testing.assert_allclose(result, expected, rtol=1e-4)
+    assert_allclose(result, expected, rtol=1e-4)
     exact = surface_potential(triangle, np.array([[0, 1, 2]]), points, accuracy=1e-12)
-    np.testing.assert_allclose(exact, expected, rtol=1e-7)
+    assert_allclose(exact, expected, rtol=1e-7)
 
 
 def test_square_from_its_centre_side_and_corner():
@@ -67,12 +70,10 @@ def test_square_from_its_centre_side_and_corner():
     points = np.array([[0.5, 0.5, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]])
     expected = np.log(1 + np.sqrt(2)) * np.array([4, 2, 2, 2])
     found = surface_potential(square, faces, points)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert_allclose(found, expected, rtol=1e-12)
     # A side's middle sees two rectangles of 1 × ½.
     middle = 2 * (np.arcsinh(0.5) + 0.5 * np.arcsinh(2))
-    np.testing.assert_allclose(
-        surface_potential(square, faces, np.array([[0.5, 0, 0]])), middle, rtol=1e-12
-    )
+    assert_allclose(surface_potential(square, faces, np.array([[0.5, 0, 0]])), middle, rtol=1e-12)
 
 
 def test_disc_on_its_axis():
@@ -85,7 +86,7 @@ def test_disc_on_its_axis():
     points = np.column_stack([0 * heights, 0 * heights, heights])
     expected = 2 * np.pi * (np.sqrt(9 + heights**2) - np.abs(heights))
     found = surface_potential(vertices, faces, points)
-    np.testing.assert_allclose(found, expected, rtol=2e-6)
+    assert_allclose(found, expected, rtol=2e-6)
 
 
 @pytest.mark.parametrize("n_subdivisions", [0, 2])
@@ -96,9 +97,9 @@ def test_centre_of_a_cylinder_of_needles(n_subdivisions):
     side = 2 * np.pi * 0.2 * 2 * np.arcsinh(2 / 0.2)
     caps = 2 * 2 * np.pi * (np.hypot(0.2, 2) - 2)
     result = surface_potential(cylinder.vertices, cylinder.faces, np.zeros((1, 3)))
-    np.testing.assert_allclose(result, side + caps, rtol=1e-4)  # a polygon of 300 sides
+    assert_allclose(result, side + caps, rtol=1e-4)  # a polygon of 300 sides
     exact = surface_potential(cylinder.vertices, cylinder.faces, np.zeros((1, 3)), accuracy=1e-12)
-    np.testing.assert_allclose(result, exact, rtol=1e-5)
+    assert_allclose(result, exact, rtol=1e-5)
 
 
 def body():
@@ -113,7 +114,7 @@ def body():
 
 def samples(vertices, faces):
     """Points inside, outside, far away, at vertices, on edges, on faces and a hair above them."""
-    generator = np.random.default_rng(0)
+    generator = default_rng(0)
     corners = vertices[faces[generator.integers(len(faces), size=40)]]
     weights = generator.dirichlet([1, 1, 1], size=40)
     on = np.einsum("pi,pij->pj", weights, corners)
@@ -150,7 +151,7 @@ def test_exact_values_are_the_sum_over_the_triangles():
     expected = [
         sum(by_quadrature(vertices[face], point) for face in faces[::37]) for point in points
     ]
-    np.testing.assert_allclose(
+    assert_allclose(
         surface_potential(vertices, faces[::37], points, accuracy=1e-13), expected, rtol=1e-7
     )
     assert (exact > expected).all()
@@ -160,25 +161,23 @@ def test_motion_scale_numbering_and_company_do_not_matter():
     vertices, faces = body()
     points = samples(vertices, faces)
     expected = surface_potential(vertices, faces, points)
-    generator = np.random.default_rng(1)
+    generator = default_rng(1)
     turn = trimesh.transformations.random_rotation_matrix(generator.random(3))[:3, :3]
     places, samples_there = (1e-4 * x @ turn.T + [3, -1, 2] for x in (vertices, points))
     moved = surface_potential(places, faces, samples_there)
-    np.testing.assert_allclose(moved, 1e-4 * expected, rtol=1e-5)
+    assert_allclose(moved, 1e-4 * expected, rtol=1e-5)
     order = generator.permutation(len(vertices))
     renumbered = np.argsort(order)[faces][generator.permutation(len(faces))][:, [1, 2, 0]]
-    np.testing.assert_allclose(
-        surface_potential(vertices[order], renumbered, points), expected, rtol=1e-5
-    )
+    assert_allclose(surface_potential(vertices[order], renumbered, points), expected, rtol=1e-5)
     alone = [surface_potential(vertices, faces, point[None])[0] for point in points[::25]]
-    np.testing.assert_allclose(alone, expected[::25], rtol=1e-5)
+    assert_allclose(alone, expected[::25], rtol=1e-5)
 
 
 def test_faces_without_area_add_nothing_and_no_points_give_none():
     vertices, faces = body()
     points = samples(vertices, faces)
     flat = np.vstack([faces, [[0, 0, 5], [7, 8, 8]]])
-    np.testing.assert_allclose(
+    assert_allclose(
         surface_potential(vertices, flat, points),
         surface_potential(vertices, faces, points),
         rtol=1e-5,

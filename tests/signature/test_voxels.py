@@ -2,7 +2,9 @@ import igl
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_array_equal
 from scipy.stats import kstest
+from trimesh.creation import box
 
 from conftest import as_mesh
 from igps.mesh.errors import MeshError
@@ -15,7 +17,7 @@ def grid_points(axes):
 
 
 def test_box_is_filled_exactly():
-    points = interior_samples(as_mesh(trimesh.creation.box((1, 2, 4))), resolution=32)
+    points = interior_samples(as_mesh(box((1, 2, 4))), resolution=32)
     assert len(points) == 8 * 16 * 32
     found = np.sort(np.unique(points[:, 0].round(9)))
     expected = (np.arange(8) - 3.5) / 8
@@ -43,7 +45,7 @@ def test_inside_equals_libigl_winding_number(make):
     axes = grid_axes(mesh, 19)
     winding = igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces), grid_points(axes))
     found = inside_grid(mesh, axes).ravel()
-    np.testing.assert_array_equal(found, winding > 0.5)
+    assert_array_equal(found, winding > 0.5)
 
 
 def test_grid_lines_through_vertices_and_edges():
@@ -52,7 +54,7 @@ def test_grid_lines_through_vertices_and_edges():
     exact = tuple(np.arange(-2, 3) / 2.0 for _ in range(3))
     points = grid_points(exact)
     expected = np.abs(points).sum(axis=1) < 1 - 1e-9
-    np.testing.assert_array_equal(inside_grid(mesh, exact).ravel(), expected)
+    assert_array_equal(inside_grid(mesh, exact).ravel(), expected)
 
 
 def _octahedron():
@@ -73,7 +75,7 @@ def test_overlapping_parts_count_as_inside_once_or_twice():
     axes = grid_axes(mesh, 24)
     winding = igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces), grid_points(axes))
     found = inside_grid(mesh, axes).ravel()
-    np.testing.assert_array_equal(found, winding > 0.5)
+    assert_array_equal(found, winding > 0.5)
 
 
 def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(sphere):
@@ -81,7 +83,7 @@ def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(spher
     whole = inside_grid(sphere, axes)
     few = np.delete(sphere.faces, [3, 700, 2222], axis=0)
     holed = Mesh(sphere.vertices, few, allow_open=True)
-    np.testing.assert_array_equal(inside_grid(holed, axes), whole)
+    assert_array_equal(inside_grid(holed, axes), whole)
     cap = sphere.faces[sphere.vertices[sphere.faces, 2].mean(axis=1) < 0.75]
     used, faces = np.unique(cap, return_inverse=True)
     bowl = Mesh(sphere.vertices[used], faces.reshape(-1, 3), allow_open=True)
@@ -89,7 +91,7 @@ def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(spher
     clear = np.abs(winding - 0.5) > 1e-6
     found = inside_grid(bowl, axes).ravel()[clear]
     expected = (winding > 0.5)[clear]
-    np.testing.assert_array_equal(found, expected)
+    assert_array_equal(found, expected)
 
 
 def test_grid_moves_and_turns_with_the_mesh(blob):
@@ -107,11 +109,11 @@ def test_min_samples_refines_the_grid(blob):
     refined = interior_samples(blob, 8, min_samples=1000)
     assert len(coarse) < 1000 <= len(refined) < 2500
     found = interior_samples(blob, 8, min_samples=len(coarse))
-    np.testing.assert_array_equal(found, coarse)
+    assert_array_equal(found, coarse)
 
 
 def test_body_too_thin_for_the_grid():
-    sheet = trimesh.creation.box((1, 1, 1e-3))
+    sheet = box((1, 1, 1e-3))
     turn = trimesh.transformations.rotation_matrix(0.4, [1, 2, 0])
     sheet.apply_transform(turn)
     with pytest.raises(MeshError, match="set min_samples to refine it"):
@@ -130,7 +132,7 @@ def test_limits_of_the_grid_are_named(blob):
 def test_surface_is_as_thick_where_the_grid_has_one_layer(axis, depth, n_inside):
     # The cell centres of a plate lie so many cells below its two faces; closer than 1e-6 cells is on the surface.
     extents = np.roll([2 * depth / 16, 1.0, 1.0], axis)
-    plate = as_mesh(trimesh.creation.box(extents))
+    plate = as_mesh(box(extents))
     axes = grid_axes(plate, 16)
     assert len(axes[axis]) == 1
     assert inside_grid(plate, axes).sum() == n_inside

@@ -7,9 +7,11 @@ import lapy
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 from problems import cotangent_problem, torus
 from scipy import sparse
 from scipy.linalg import eigh
+from trimesh.creation import icosphere
 
 from conftest import torch_threads
 from igps.mesh.mesh import Mesh
@@ -38,7 +40,7 @@ def assert_pairs(spectrum, problem, tolerance=1e-07):
     assert (lengths / values).max() <= 2 * tolerance
     products = functions.T @ (mass[:, None] * functions)
     expected = np.eye(len(values))
-    np.testing.assert_allclose(products, expected, atol=1e-10)
+    assert_allclose(products, expected, atol=1e-10)
     assert np.abs(mass @ functions).max() < 1e-9 * np.sqrt(mass.sum())
 
 
@@ -47,18 +49,18 @@ def test_agrees_with_a_dense_solver(n_eigenpairs, torus_problem, torus_oracle):
     stiffness, mass, positions = torus_problem
     spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions)
     expected = torus_oracle[0][1 : n_eigenpairs + 1]
-    np.testing.assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
     assert_pairs(spectrum, torus_problem)
 
 
 def test_sphere_has_multiplets_of_odd_size():
     """l(l + 1) with multiplicity 2l + 1 on the unit sphere; the last multiplet is cut."""
-    mesh = trimesh.creation.icosphere(subdivisions=4)
+    mesh = icosphere(subdivisions=4)
     problem = cotangent_problem(mesh)
     spectrum = eigenpairs(problem[0], problem[1], 110, positions=problem[2])
     degree = np.repeat(np.arange(1, 11), 2 * np.arange(1, 11) + 1)[:110]
     expected = degree * (degree + 1)
-    np.testing.assert_allclose(spectrum.eigenvalues, expected, rtol=0.045)
+    assert_allclose(spectrum.eigenvalues, expected, rtol=0.045)
     assert_pairs(spectrum, problem)
 
 
@@ -86,7 +88,7 @@ def test_multiplets_larger_than_the_block():
     for n_eigenpairs in (38, 39, 60, 100):
         spectrum = eigenpairs(problem[0], problem[1], n_eigenpairs)
         expected = values[1 : n_eigenpairs + 1]
-        np.testing.assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+        assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
         assert_pairs(spectrum, problem)
 
 
@@ -96,13 +98,13 @@ def test_more_copies_than_distinct_eigenvalues():
     values = np.linalg.eigvalsh(problem[0].toarray())
     spectrum = eigenpairs(problem[0], problem[1], 299)
     expected = values[1:300]
-    np.testing.assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
     assert_pairs(spectrum, problem)
 
 
 def test_threads_change_no_bit(many_cores, monkeypatch):
     """10,242 vertices: two pieces of the basis, two subtrees; and a team, though the result is small."""
-    sphere = trimesh.creation.icosphere(subdivisions=5)
+    sphere = icosphere(subdivisions=5)
     sphere.vertices *= 1, 0.8, 0.6
     stiffness, mass, positions = cotangent_problem(sphere)
     monkeypatch.setattr("igps.spectra._lanczos.MIN_TEAM_RESULT", 0)
@@ -112,8 +114,8 @@ def test_threads_change_no_bit(many_cores, monkeypatch):
             spectra.append(eigenpairs(stiffness, mass, 20, positions=positions))
     assert_pairs(spectra[0], (stiffness, mass, positions))
     for other in spectra[1:]:
-        np.testing.assert_array_equal(other.eigenvalues, spectra[0].eigenvalues)
-        np.testing.assert_array_equal(other.eigenfunctions, spectra[0].eigenfunctions)
+        assert_array_equal(other.eigenvalues, spectra[0].eigenvalues)
+        assert_array_equal(other.eigenfunctions, spectra[0].eigenfunctions)
 
 
 def test_eigenvalues_are_the_quotients_of_their_vectors(torus_problem):
@@ -121,7 +123,7 @@ def test_eigenvalues_are_the_quotients_of_their_vectors(torus_problem):
     spectrum = eigenpairs(stiffness, mass, 100, positions=positions, tolerance=1e-3)
     functions = spectrum.eigenfunctions
     quotients = np.einsum("vk,vk->k", functions, stiffness @ functions)
-    np.testing.assert_allclose(spectrum.eigenvalues, quotients, rtol=1e-13)
+    assert_allclose(spectrum.eigenvalues, quotients, rtol=1e-13)
 
 
 def test_a_large_basis_gives_its_place_to_the_eigenvectors(
@@ -131,7 +133,7 @@ def test_a_large_basis_gives_its_place_to_the_eigenvectors(
     monkeypatch.setattr("igps.spectra._basis.MAX_SINGLE_ENTRIES", 1000)
     spectrum = eigenpairs(stiffness, mass, 130, positions=positions)
     expected = torus_oracle[0][1:131]
-    np.testing.assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
     assert_pairs(spectrum, torus_problem)
 
 
@@ -141,7 +143,7 @@ def test_scale_of_the_coordinates(scale, torus_problem):
     one = eigenpairs(stiffness, mass, 50, positions=positions)
     other = eigenpairs(stiffness, mass * scale**2, 50, positions=positions * scale)
     found = other.eigenvalues * scale**2
-    np.testing.assert_allclose(found, one.eigenvalues, rtol=1e-10)
+    assert_allclose(found, one.eigenvalues, rtol=1e-10)
     assert_pairs(other, (stiffness, mass * scale**2, positions))
 
 
@@ -150,16 +152,16 @@ def test_same_seed_same_bits_other_seed_same_space(torus_problem):
     one, again, other = (
         eigenpairs(stiffness, mass, 40, positions=positions, seed=seed) for seed in (0, 0, 1)
     )
-    np.testing.assert_array_equal(one.eigenfunctions, again.eigenfunctions)
+    assert_array_equal(one.eigenfunctions, again.eigenfunctions)
     assert not np.array_equal(one.eigenfunctions, other.eigenfunctions)
-    np.testing.assert_allclose(one.eigenvalues, other.eigenvalues, rtol=1e-10)
+    assert_allclose(one.eigenvalues, other.eigenvalues, rtol=1e-10)
 
 
 def test_positions_change_only_the_work(torus_problem):
     stiffness, mass, positions = torus_problem
     with_positions = eigenpairs(stiffness, mass, 60, positions=positions)
     without = eigenpairs(stiffness, mass, 60)
-    np.testing.assert_allclose(without.eigenvalues, with_positions.eigenvalues, rtol=1e-10)
+    assert_allclose(without.eigenvalues, with_positions.eigenvalues, rtol=1e-10)
 
 
 @pytest.mark.parametrize("n_vertices", [4, 12])
@@ -169,7 +171,7 @@ def test_tiny_meshes(n_vertices):
     spectrum = eigenpairs(*problem[:2], n_vertices - 2)
     values = eigh(problem[0].toarray(), np.diag(problem[1]), eigvals_only=True)
     expected = values[1:-1]
-    np.testing.assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
     assert_pairs(spectrum, problem)
 
 
@@ -184,7 +186,7 @@ def test_flat_triangles_with_huge_cotangents():
     spectrum = eigenpairs(problem[0], problem[1], 80, positions=problem[2])
     values = eigh(problem[0].toarray(), np.diag(problem[1]), eigvals_only=True)
     expected = values[1:81]
-    np.testing.assert_allclose(spectrum.eigenvalues, expected, rtol=1e-7)
+    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-7)
 
 
 def fail(*arguments):
@@ -196,7 +198,7 @@ def test_falls_back_to_arpack_with_a_warning(torus_problem, monkeypatch, caplog)
     expected = eigenpairs(stiffness, mass, 30, positions=positions)
     monkeypatch.setattr(eigensolver, "lanczos", fail)
     spectrum = eigenpairs(stiffness, mass, 30, positions=positions)
-    np.testing.assert_allclose(spectrum.eigenvalues, expected.eigenvalues, rtol=1e-10)
+    assert_allclose(spectrum.eigenvalues, expected.eigenvalues, rtol=1e-10)
     assert_pairs(spectrum, torus_problem)
     assert "falling back to ARPACK: on purpose" in caplog.text
 
@@ -207,7 +209,7 @@ def test_a_shift_below_the_spectrum_takes_over(torus_problem, torus_oracle, monk
     with caplog.at_level(logging.INFO):
         spectrum = eigenpairs(stiffness, mass, 80, positions=positions)
     expected = torus_oracle[0][1:81]
-    np.testing.assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
     assert_pairs(spectrum, torus_problem)
     assert "falling back to a shift below the spectrum: on purpose" in caplog.text
     assert "ARPACK" not in caplog.text
@@ -247,8 +249,8 @@ def test_mass_may_be_a_diagonal_matrix(pack, torus_problem):
     stiffness, mass, positions = torus_problem
     of_vector = eigenpairs(stiffness, mass, 20, positions=positions)
     of_matrix = eigenpairs(stiffness, pack(mass), 20, positions=positions)
-    np.testing.assert_array_equal(of_matrix.eigenfunctions, of_vector.eigenfunctions)
-    np.testing.assert_array_equal(of_matrix.mass, mass)
+    assert_array_equal(of_matrix.eigenfunctions, of_vector.eigenfunctions)
+    assert_array_equal(of_matrix.mass, mass)
 
 
 def test_takes_the_matrices_of_other_libraries():
@@ -260,9 +262,9 @@ def test_takes_the_matrices_of_other_libraries():
     values = solver.eigs(25)[0][1:]
     of_lapy = eigenpairs(solver.stiffness, solver.mass, 24)
     # LaPy computes in single precision
-    np.testing.assert_allclose(of_lapy.eigenvalues, values, rtol=1e-5)
+    assert_allclose(of_lapy.eigenvalues, values, rtol=1e-5)
     of_igl = eigenpairs(-igl.cotmatrix(vertices, faces), igl.massmatrix(vertices, faces, 0), 24)
-    np.testing.assert_allclose(of_igl.eigenvalues, values, rtol=1e-5)
+    assert_allclose(of_igl.eigenvalues, values, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("length", "usable"), [(400, True), (8000, False)])
@@ -281,13 +283,13 @@ def test_arguments_are_left_alone(torus_problem):
     stiffness, mass, positions = (array.copy() for array in torus_problem)
     spectrum = eigenpairs(stiffness, mass, 20, positions=positions)
     assert (stiffness != torus_problem[0]).nnz == 0
-    np.testing.assert_array_equal(mass, torus_problem[1])
-    np.testing.assert_array_equal(positions, torus_problem[2])
+    assert_array_equal(mass, torus_problem[1])
+    assert_array_equal(positions, torus_problem[2])
     assert not np.shares_memory(spectrum.mass, mass)
 
 
 def test_two_components_are_counted_at_any_scale():
-    one = trimesh.creation.icosphere(subdivisions=2)
+    one = icosphere(subdivisions=2)
     two = trimesh.util.concatenate([one, one.copy().apply_translation([3, 0, 0])])
     for scale in (1e-6, 1, 1e6):
         stiffness, mass, _ = cotangent_problem(two)
@@ -296,7 +298,7 @@ def test_two_components_are_counted_at_any_scale():
 
 
 def test_components_tied_by_rounding_alone_are_counted():
-    stiffness, mass, _ = cotangent_problem(trimesh.creation.icosphere(subdivisions=1))
+    stiffness, mass, _ = cotangent_problem(icosphere(subdivisions=1))
     both = sparse.lil_array(sparse.block_diag([stiffness, stiffness]))
     both[0, len(mass)] = both[len(mass), 0] = -1e-17
     with pytest.raises(ValueError, match="expected 1 connected component, got 2"):

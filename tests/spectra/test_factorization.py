@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.random import default_rng
 from problems import cotangent_problem, torus
 from scipy import sparse
 
@@ -21,7 +22,7 @@ EPSILON = float(np.finfo(float).eps)
 
 def grid_matrix(n, seed=0):
     """A symmetric indefinite matrix on a jittered, triangulated n × n grid, and the places of its vertices."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     index = np.arange(n * n).reshape(n, n)
     pairs = [
         (index[1:], index[:-1]),
@@ -40,8 +41,8 @@ def grid_matrix(n, seed=0):
 
 def random_graph_matrix(n, seed):
     """A symmetric matrix on a random graph, not connected and without any geometry."""
-    pattern = sparse.random_array((n, n), density=min(1, 1.5 / n), rng=np.random.default_rng(seed))
-    diagonal = np.random.default_rng(seed).normal(size=n)
+    pattern = sparse.random_array((n, n), density=min(1, 1.5 / n), rng=default_rng(seed))
+    diagonal = default_rng(seed).normal(size=n)
     return sparse.csr_array(pattern + pattern.T + sparse.diags_array(diagonal))
 
 
@@ -90,7 +91,7 @@ def elimination_growth(factors):
 def test_solve_and_inertia_on_a_grid(shift, leaf_size, with_places):
     matrix, places = grid_matrix(23)
     dense = matrix.toarray() - shift * np.eye(matrix.shape[0])
-    right = np.random.default_rng(1).normal(size=(len(dense), 5))
+    right = default_rng(1).normal(size=(len(dense), 5))
     structure = analyse(matrix, places if with_places else None, leaf_size=leaf_size)
     factors = structure.factorize(matrix, shift)
     solution = factors.solve(torch.from_numpy(right)).numpy()
@@ -112,7 +113,7 @@ def test_slivers_and_shifts_among_the_eigenvalues_cost_no_digits(shift, leaf_siz
     """
     matrix, places = sliver_matrix()
     structure = analyse(matrix, places if with_places else None, leaf_size=leaf_size)
-    right = np.random.default_rng(1).normal(size=(matrix.shape[0], 5))
+    right = default_rng(1).normal(size=(matrix.shape[0], 5))
     errors = []
     for other in (0.8 * shift, shift, 1.25 * shift):
         shifted = matrix.toarray() - other * np.eye(matrix.shape[0])
@@ -131,7 +132,7 @@ def test_solve_and_inertia_on_random_graphs(n):
     matrix = random_graph_matrix(n, seed=n)
     dense = matrix.toarray()
     factors = analyse(matrix, leaf_size=8).factorize(matrix)
-    right = np.random.default_rng(n).normal(size=(n, 2))
+    right = default_rng(n).normal(size=(n, 2))
     solution = factors.solve(torch.from_numpy(right)).numpy()
     assert backward_error(dense, solution, right) < 10 * EPSILON
     expected = (np.linalg.eigvalsh(dense) < 0).sum()
@@ -151,7 +152,7 @@ def test_subtrees_eliminated_side_by_side():
     structure = analyse(matrix, places)
     factors = structure.factorize(matrix, shift)
     assert factors.n_negative == structure.inertia(matrix, shift) == behind + 1
-    right = torch.from_numpy(np.random.default_rng(1).normal(size=(143**2, 2)))
+    right = torch.from_numpy(default_rng(1).normal(size=(143**2, 2)))
     solution = factors.solve(right)
     residual = matrix @ solution.numpy() - shift * solution.numpy() - right.numpy()
     assert np.abs(residual).max() < 1e4 * EPSILON * 8 * float(solution.abs().max())

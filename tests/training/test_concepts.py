@@ -11,6 +11,7 @@ from docs import concepts
 from docs.benchmarks.weld import TUBE_FACES, facing_vertices, weld
 from matplotlib.colors import to_hex
 from matplotlib.image import imread
+from numpy.testing import assert_allclose
 from scipy.spatial.distance import pdist
 
 from bodies import mean_value_coordinates
@@ -97,8 +98,8 @@ def test_pose_draws_the_histogram_of_every_mesh(root, tmp_path, drawn, capsys):
     balls = [histogram(dataset, f"ball/{i}.off") for i in range(2)]
     centres = (np.arange(64) + 0.5) / 16
     for line, curve in zip(lines, eggs + balls, strict=True):
-        np.testing.assert_allclose(line.get_xdata(), centres, rtol=1e-6)
-        np.testing.assert_allclose(line.get_ydata(), 100 * curve, atol=0.02)
+        assert_allclose(line.get_xdata(), centres, rtol=1e-6)
+        assert_allclose(line.get_ydata(), 100 * curve, atol=0.02)
     within = np.median([chi_square(*pair) for pair in itertools.combinations(eggs, 2)])
     others = np.median([chi_square(*pair) for pair in itertools.product(eggs, balls)])
     (row,) = re.findall(r"^egg 3 (\S+) (\S+)$", printed, re.MULTILINE)
@@ -176,7 +177,7 @@ def test_potential_is_least_in_the_middle(tmp_path, drawn):
     turned = Mesh(concepts.upright(mesh.vertices), mesh.faces)
     found = concepts.potential_slice(turned, n_eigenpairs=40, resolution=32)
     centre = found.barycentroid
-    np.testing.assert_allclose(np.abs(centre), [7, 6], atol=0.02)
+    assert_allclose(np.abs(centre), [7, 6], atol=0.02)
     x, y = found.axes
     grid_x, grid_y = np.meshgrid(x - centre[0], y - centre[1], indexing="ij")
     ellipse = np.sqrt(grid_x**2 + (grid_y / 2) ** 2)
@@ -199,7 +200,7 @@ def test_potential_is_least_in_the_middle(tmp_path, drawn):
     assert "potential" in bar.get_ylabel()
     assert "unit" in panel.get_xlabel()
     (star,) = [line for line in panel.get_lines() if line.get_marker() == "*"]
-    np.testing.assert_allclose(star.get_xydata()[0], centre, atol=1e-6)
+    assert_allclose(star.get_xydata()[0], centre, atol=1e-6)
     assert imread(tmp_path / "potential.png").std() > 0.05
 
 
@@ -208,7 +209,7 @@ def test_upright_turns_without_mirroring():
     turned = concepts.upright(points)
     frame = np.linalg.lstsq(points, turned, rcond=None)[0]
     expected = np.eye(3)
-    np.testing.assert_allclose(frame.T @ frame, expected, atol=1e-9)
+    assert_allclose(frame.T @ frame, expected, atol=1e-9)
     assert np.linalg.det(frame) == pytest.approx(1)
     # The longest axis is up, and not upside down.
     assert frame[1, 1] > 0.95

@@ -5,6 +5,8 @@ import pytest
 import trimesh
 from docs.benchmarks.robustness import DISTURBANCES
 from docs.benchmarks.weld import weld_gap
+from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
 from training.disturbances import clip, hole, move, noise, remesh, scale, simplified
 
 from conftest import as_trimesh, horseshoe, surface_genus
@@ -13,14 +15,14 @@ from igps.mesh.mesh import Mesh
 
 def test_noise_moves_along_the_normals(sphere):
     noisy = noise(sphere, 0.01, seed=3)
-    radius = np.linalg.norm(noisy.vertices, axis=1)
+    radius = norm(noisy.vertices, axis=1)
     found = noisy.vertices / radius[:, None]
-    np.testing.assert_allclose(found, sphere.vertices, atol=1e-3)
+    assert_allclose(found, sphere.vertices, atol=1e-3)
     expected = pytest.approx(0.01 * sphere.diagonal, rel=0.05)
     assert np.std(radius - 1) == expected
     assert abs(np.mean(radius - 1)) < 0.002
     expected = noise(sphere, 0.01, seed=3).vertices
-    np.testing.assert_array_equal(noisy.vertices, expected)
+    assert_array_equal(noisy.vertices, expected)
     assert np.abs(noisy.vertices - noise(sphere, 0.01, seed=4).vertices).max() > 0.01
     with pytest.raises(ValueError, match="amplitude"):
         noise(sphere, 0)
@@ -38,10 +40,10 @@ def test_remesh_gives_other_triangles_on_the_same_surface(sphere):
     assert 0.98 * len(sphere.faces) <= len(other.faces) <= len(sphere.faces)
     inner = as_trimesh(sphere)
     least = np.abs(np.einsum("ij,ij->i", inner.face_normals, inner.triangles_center)).min()
-    radius = np.linalg.norm(other.vertices, axis=1)
+    radius = norm(other.vertices, axis=1)
     assert least - 1e-9 <= radius.min()
     assert radius.max() <= 1 + 1e-9
-    nearest = np.linalg.norm(other.vertices[:, None] - sphere.vertices[None], axis=2).min(axis=1)
+    nearest = norm(other.vertices[:, None] - sphere.vertices[None], axis=2).min(axis=1)
     assert (nearest > 1e-6).mean() > 0.3
     assert other.volume == pytest.approx(sphere.volume, rel=5e-3)
     assert surface_genus(remesh(weld_gap(horseshoe()))) == 1
@@ -59,7 +61,7 @@ def test_hole_is_one_patch_of_the_wanted_area(sphere):
     # the grain of paths along edges.
     assert len(trimesh.graph.connected_components(rim)) == 1
     middle = -holed.vertices.mean(axis=0)
-    angle = np.arccos(holed.vertices @ middle / np.linalg.norm(middle))
+    angle = np.arccos(holed.vertices @ middle / norm(middle))
     assert angle[np.unique(rim)].max() < 1.35 * np.arccos(1 - 2 * 0.05)
     assert angle.min() > 0.65 * np.arccos(1 - 2 * 0.05)
     with pytest.raises(ValueError, match="share"):
@@ -87,8 +89,8 @@ def test_clip_takes_a_cap_off_a_ball(sphere):
     lost_area = 2 * np.pi * height - np.pi * height * (2 - height)
     assert sphere.area - cut.area == pytest.approx(lost_area, rel=0.05)
     # All that remains is where it was.
-    radius = np.linalg.norm(cut.vertices - turned.vertices.mean(axis=0), axis=1)
-    np.testing.assert_allclose(radius.max(), 1, atol=1e-6)
+    radius = norm(cut.vertices - turned.vertices.mean(axis=0), axis=1)
+    assert_allclose(radius.max(), 1, atol=1e-6)
 
 
 def test_clip_keeps_the_largest_piece():
@@ -112,16 +114,16 @@ def test_clip_keeps_the_largest_piece():
 def test_scale_and_motion_keep_the_form(blob):
     larger = scale(blob, 7)
     moved = move(blob, seed=1)
-    np.testing.assert_allclose(larger.vertices, 7 * blob.vertices)
+    assert_allclose(larger.vertices, 7 * blob.vertices)
     for mesh in (larger, moved):
-        np.testing.assert_array_equal(mesh.faces, blob.faces)
+        assert_array_equal(mesh.faces, blob.faces)
     before = blob.vertices - blob.vertices.mean(axis=0)
     after = moved.vertices - moved.vertices.mean(axis=0)
-    np.testing.assert_allclose(after @ after.T, before @ before.T, atol=1e-12)
+    assert_allclose(after @ after.T, before @ before.T, atol=1e-12)
     assert moved.volume == pytest.approx(blob.volume)  # no mirror image
     assert np.abs(after - before).max() > 0.1
     offset = moved.vertices.mean(axis=0) - blob.vertices.mean(axis=0)
-    assert np.linalg.norm(offset) == pytest.approx(2 * blob.diagonal)
+    assert norm(offset) == pytest.approx(2 * blob.diagonal)
     for factor in (0, np.inf):
         with pytest.raises(ValueError, match="factor"):
             scale(blob, factor)
@@ -137,5 +139,5 @@ def test_every_disturbance_says_what_it_did(name):
     assert disturbed.allow_open == (name == "hole")
     has_others = not np.array_equal(disturbed.faces, mesh.faces)
     assert has_others or not np.array_equal(disturbed.vertices, mesh.vertices)
-    np.testing.assert_array_equal(mesh.vertices, before[0])
-    np.testing.assert_array_equal(mesh.faces, before[1])
+    assert_array_equal(mesh.vertices, before[0])
+    assert_array_equal(mesh.faces, before[1])

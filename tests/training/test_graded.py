@@ -6,6 +6,8 @@ import re
 import numpy as np
 import pytest
 import trimesh
+from numpy.random import default_rng
+from numpy.testing import assert_array_equal
 from scipy.spatial.distance import pdist
 from training.shapes import GradedShapes, body_of
 from training.shapes.bodies import draw_body, draw_pose
@@ -42,7 +44,7 @@ BENDING = [
 
 def drawn(kind, number=0):
     body = draw_body(CLASSES[FIRST[kind]], [2, number], [0, number])
-    return draw_pose(body, np.random.default_rng([1, number]), 3000)
+    return draw_pose(body, default_rng([1, number]), 3000)
 
 
 @pytest.fixture(scope="module")
@@ -88,13 +90,13 @@ def test_animals_bend_and_things_do_not(poses):
     """The greatest change of a distance between two vertices, over the body's extent."""
 
     def change(pose):
-        some = np.random.default_rng(0).choice(len(pose.rest), 300, replace=False)
+        some = default_rng(0).choice(len(pose.rest), 300, replace=False)
         rest = pdist(pose.rest[some])
         bent = pdist(pose.bent[some])
         return float(np.abs(rest - bent).max() / rest.max())
 
     for kind in ("mug", "chair", "vessel", "table", "stack", "machine"):
-        np.testing.assert_array_equal(poses[kind].bent, poses[kind].rest)
+        assert_array_equal(poses[kind].bent, poses[kind].rest)
     changes = [change(poses[kind]) for kind in BENDING]
     assert min(changes) > 0.005  # some poses are nearly at rest
     assert np.median(changes) > 0.15
@@ -103,7 +105,7 @@ def test_animals_bend_and_things_do_not(poses):
 def test_every_sheet_has_the_holes_that_its_name_tells():
     """Of every outline, also of those whose middle is a disc; each hole is a handle."""
     for outline in SHEETS:
-        without, *others = (sheet(np.random.default_rng(3), outline, n).genus for n in (0, 1, 2, 4))
+        without, *others = (sheet(default_rng(3), outline, n).genus for n in (0, 1, 2, 4))
         assert others == [without + 1, without + 2, without + 4]
     stars = [one for one in CLASSES if re.match("sheet-star-(?!0-)", one.name)]
     assert len(stars) == 3
@@ -157,8 +159,8 @@ def test_same_seed_same_arrays_other_seed_others(made):
     """A shape depends neither on those made before nor on how many classes, bodies and poses there are."""
     more = GradedShapes(5, 4, 7, seed=2, n_vertices=N_VERTICES)
     again = more[more.names.index(made[17].name)]
-    np.testing.assert_array_equal(again.vertices, made[17].vertices)
-    np.testing.assert_array_equal(again.faces, made[17].faces)
+    assert_array_equal(again.vertices, made[17].vertices)
+    assert_array_equal(again.faces, made[17].faces)
     other = GradedShapes(3, 2, 3, seed=3, n_vertices=N_VERTICES)[4]
     assert not np.array_equal(other.vertices, made[4].vertices)
 
@@ -208,7 +210,7 @@ def test_write_makes_folders_of_classes_and_bodies(tmp_path):
     bodies = [body_of(name) for name in files.names]
     assert bodies == ["biped/00", "biped/00", "biped/01", "biped/01"]
     read = trimesh.load(files.paths[3], process=False)
-    np.testing.assert_array_equal(read.vertices, shapes[3].vertices)
+    assert_array_equal(read.vertices, shapes[3].vertices)
 
     before = [path.read_bytes() for path in files.paths]
     times = [path.stat().st_mtime_ns for path in files.paths]
@@ -224,7 +226,7 @@ def test_write_makes_folders_of_classes_and_bodies(tmp_path):
 def test_it_travels_to_other_processes(shapes, made):
     again = pickle.loads(pickle.dumps(shapes))
     assert repr(again) == repr(shapes)
-    np.testing.assert_array_equal(again[7].vertices, made[7].vertices)
+    assert_array_equal(again[7].vertices, made[7].vertices)
 
 
 @pytest.mark.parametrize(
@@ -249,7 +251,7 @@ def counted_volume(solid):
     low, high = solid.box()
     low = low - 0.05
     high = high + 0.05
-    points = np.random.default_rng(0).uniform(low, high, (300_000, 3))
+    points = default_rng(0).uniform(low, high, (300_000, 3))
     inside = solid.distance(*points.T) < 0.0
     assert (points[inside] >= solid.box()[0] - 1e-6).all()
     assert (points[inside] <= solid.box()[1] + 1e-6).all()
@@ -275,5 +277,5 @@ def test_a_helix_has_its_volume():
 def test_a_machine_part_with_an_ear_has_a_hole():
     for kind in MACHINES:
         for extra in ("plain", "collar", "shaft", "ear", "pins"):
-            part = machine(np.random.default_rng(0), kind, extra, 3)
+            part = machine(default_rng(0), kind, extra, 3)
             assert part.genus >= (extra == "ear"), (kind, extra)

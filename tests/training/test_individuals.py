@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
 from training.shapes import GradedShapes, body_of, individual_of
 from training.shapes.individuals import SHARES
 
@@ -27,13 +28,13 @@ def test_individuals_are_changed_by_a_hundredth_to_a_twentieth_of_the_root_of_th
         for one in range(N_INDIVIDUALS):
             after = shapes._individual(number, 0, one).warp(vertices)
             found.append(after)
-            step = np.linalg.norm(after - before, axis=1).max() / size
+            step = norm(after - before, axis=1).max() / size
             assert SHARES[0] * 0.95 < step < SHARES[1] * 1.05
             _, aligned, _ = trimesh.registration.procrustes(after, before, reflection=False)
-            left = np.linalg.norm(aligned - before, axis=1).max() / size
+            left = norm(aligned - before, axis=1).max() / size
             assert 0.7 * step < left < 1.3 * step
         for one, other in itertools.combinations(found, 2):
-            between = np.linalg.norm(one - other, axis=1).max() / size
+            between = norm(one - other, axis=1).max() / size
             assert SHARES[0] * 0.5 < between < 2.1 * SHARES[1]
 
 

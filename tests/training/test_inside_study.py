@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from docs.benchmarks.inside import at_rest, equal_histogram, nearest_share, rejections
+from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 from training.shapes.bodies import Pose
 
@@ -15,13 +16,13 @@ def test_points_of_a_moved_body_are_moved_back():
     turn = Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix()
     bent = ball.vertices @ turn.T + [1.0, 2.0, 3.0]
     pose = Pose(np.asarray(ball.vertices), bent, np.asarray(ball.faces), 0.0)
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
+    points = default_rng(0).uniform(-0.5, 0.5, (50, 3))
     found = at_rest(points @ turn.T + [1.0, 2.0, 3.0], pose)
     np.testing.assert_allclose(found, points, atol=1e-9)
 
 
 def test_values_of_all_bodies_have_the_same_histogram():
-    random = np.random.default_rng(0)
+    random = default_rng(0)
     first = random.normal(size=300)
     second = random.gamma(1.0, size=300) * 1000
     values = equal_histogram(first)
@@ -39,7 +40,7 @@ def test_the_share_of_neighbours_is_counted_among_other_rows():
 
 @pytest.mark.parametrize("shift", [0.0, 3.0])
 def test_groups_are_told_apart_only_if_they_differ(shift):
-    rows = np.random.default_rng(1).normal(size=(24, len(column_names(["x"]))))
+    rows = default_rng(1).normal(size=(24, len(column_names(["x"]))))
     rows[12:] += shift
     found = rejections(rows, 12, 0, has_numbers=True)
     assert found == [bool(shift)] * 4

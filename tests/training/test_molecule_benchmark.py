@@ -4,6 +4,9 @@ import numpy as np
 import torch
 from docs.benchmarks import molecular_shares as shares_program
 from docs.benchmarks import molecules as program
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 
 from igps.fields.molecules.molecule import Molecule
 from igps.retrieval import retrieval_scores
@@ -11,14 +14,14 @@ from igps.retrieval import retrieval_scores
 
 def chain(seed, n=70):
     """A compact walk with helices of 14 residues between turns."""
-    generator = np.random.default_rng(seed)
+    generator = default_rng(seed)
     positions = [np.zeros(3)]
     direction = np.array([1.0, 0, 0])
     for i in range(1, n):
         if i % 14 == 0:
             towards = -np.mean(positions, axis=0)
-            direction = generator.normal(size=3) + towards / (np.linalg.norm(towards) + 1)
-            direction /= np.linalg.norm(direction)
+            direction = generator.normal(size=3) + towards / (norm(towards) + 1)
+            direction /= norm(direction)
         across = np.linalg.qr(np.column_stack([direction, np.eye(3)[:, :2] + 0.1]))[0][:, 1:]
         turn = np.radians(100 * i)
         winding = 2.3 * (np.cos(turn) * across[:, 0] + np.sin(turn) * across[:, 1])
@@ -41,7 +44,7 @@ def test_families_share_folds_and_compositions_cross_them():
 
 
 def test_threading_changes_the_residues_and_not_the_fold():
-    generator = np.random.default_rng(0)
+    generator = default_rng(0)
     made = program.threaded(CHAINS[0], np.full(20, 0.05), generator)
     assert len(set(made.residue_names)) > 10
     found = float(program.fold_distances([CHAINS[0], made])[0, 1])
@@ -49,7 +52,7 @@ def test_threading_changes_the_residues_and_not_the_fold():
 
 
 def test_a_bent_chain_keeps_the_distances_within_its_halves():
-    generator = np.random.default_rng(0)
+    generator = default_rng(0)
     bent = program.bent_chain(CHAINS[1], 40, generator)
     before = torch.cdist(*[torch.tensor(CHAINS[1].residue_positions)] * 2)
     after = torch.cdist(*[torch.tensor(bent.residue_positions)] * 2)
@@ -67,34 +70,34 @@ def test_an_elastic_network_resists_all_but_rigid_motions():
     positions = CHAINS[2].residue_positions
     stiffness = program.elastic_network(positions).toarray()
     turning = np.cross([0.3, -0.2, 0.5], positions).ravel()
-    np.testing.assert_allclose(stiffness @ turning, 0, atol=1e-9)
+    assert_allclose(stiffness @ turning, 0, atol=1e-9)
     found = stiffness @ np.tile([1.0, 2, 3], len(positions))
-    np.testing.assert_allclose(found, 0, atol=1e-9)
+    assert_allclose(found, 0, atol=1e-9)
     values = np.linalg.eigvalsh(stiffness)
     assert (values[:6] < 1e-9).all()
     assert values[6] > 1e-4
 
 
 def test_deformed_and_permuted_chains_move_as_far_as_told():
-    generator = np.random.default_rng(0)
+    generator = default_rng(0)
     moved = program.deformed(CHAINS[3], generator).residue_positions
     shift = np.sqrt(((moved - CHAINS[3].residue_positions) ** 2).sum(axis=1).mean())
     assert abs(shift - np.hypot(program.FLUCTUATION, program.NOISE * 3**0.5)) < 0.5
     turned = program.permuted(CHAINS[3], generator)
     assert turned.places.tolist() == list(range(70))
-    steps = np.linalg.norm(np.diff(turned.residue_positions, axis=0), axis=1)
+    steps = norm(np.diff(turned.residue_positions, axis=0), axis=1)
     assert (steps > 6).sum() <= 3  # the ends that were joined
 
 
 def test_relatives_are_backbones_without_some_ends(tmp_path):
-    generator = np.random.default_rng(1)
+    generator = default_rng(1)
     offsets = np.array([[-1.2, 0.5, 0], [0, 0, 0], [0.9, 1.1, 0], [0.3, 2.2, 0.4]])
     positions = CHAINS[4].residue_positions[:, None] + offsets
     names = generator.choice(program.AMINO_ACIDS, 70).tolist()
     shares_program.write_changed(tmp_path, positions, names, generator)
     found = {path.stem: shares_program.backbone(path) for path in tmp_path.iterdir()}
     at, kinds = found["whole"]
-    np.testing.assert_allclose(at, positions, atol=1e-3)
+    assert_allclose(at, positions, atol=1e-3)
     assert kinds == names
     for title, same in (("bent", 1.0), ("deformed", 1.0), ("relative", 0.4)):
         at, kinds = found[title]

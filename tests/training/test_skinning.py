@@ -2,6 +2,7 @@
 
 import numpy as np
 import trimesh
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from training.shapes.kinds import KINDS
 from training.shapes.rigging import bones_at_rest, limb_rig
@@ -34,7 +35,7 @@ def test_products_are_those_of_rotations():
     found = product(scalar_first(a), scalar_first(b))
     expected = scalar_first(a * b)
     expected *= np.sign((found * expected).sum(axis=1, keepdims=True))
-    np.testing.assert_allclose(found, expected, atol=1e-14)
+    assert_allclose(found, expected, atol=1e-14)
 
 
 def test_a_motion_turns_and_then_moves():
@@ -42,18 +43,18 @@ def test_a_motion_turns_and_then_moves():
     steps = g.normal(size=(50, 3))
     found = transform(motion(scalar_first(turns), steps), POINTS)
     expected = turns.apply(POINTS) + steps
-    np.testing.assert_allclose(found, expected, atol=1e-13)
+    assert_allclose(found, expected, atol=1e-13)
 
 
 def test_a_turn_about_a_point_leaves_it_where_it_is():
     vectors = g.normal(size=(50, 3))
     centres = g.normal(size=(50, 3))
     turns = rotations_about(centres, vectors)
-    np.testing.assert_allclose(transform(turns, centres), centres, atol=1e-13)
+    assert_allclose(transform(turns, centres), centres, atol=1e-13)
     expected = Rotation.from_rotvec(vectors).apply(POINTS - centres) + centres
-    np.testing.assert_allclose(transform(turns, POINTS), expected, atol=1e-13)
+    assert_allclose(transform(turns, POINTS), expected, atol=1e-13)
     still = rotations_about(centres, np.zeros((50, 3)))
-    np.testing.assert_allclose(transform(still, POINTS), POINTS, atol=1e-15)
+    assert_allclose(transform(still, POINTS), POINTS, atol=1e-15)
 
 
 def test_one_motion_after_another():
@@ -61,7 +62,7 @@ def test_one_motion_after_another():
     second = rotations_about(g.normal(size=(50, 3)), g.normal(size=(50, 3)))
     found = transform(compose(first, second), POINTS)
     expected = transform(first, transform(second, POINTS))
-    np.testing.assert_allclose(found, expected, atol=1e-13)
+    assert_allclose(found, expected, atol=1e-13)
 
 
 def test_a_blend_is_rigid_and_half_way_between():
@@ -72,7 +73,7 @@ def test_a_blend_is_rigid_and_half_way_between():
     b = rotations_about(centre, 1.6 * axis)
     half = normalized(Motions(0.5 * (a.real + b.real), 0.5 * (a.dual + b.dual)))
     expected = Rotation.from_rotvec(0.8 * axis).apply(POINTS - centre) + centre
-    np.testing.assert_allclose(transform(half, POINTS), expected, atol=1e-13)
+    assert_allclose(transform(half, POINTS), expected, atol=1e-13)
 
 
 def cylinder(length, radius):
@@ -102,7 +103,7 @@ def test_one_element_that_turns_carries_everything_rigidly():
     turns[0] = (0.3, -1.1, 0.4)
     bar, moved_bar = bent_bar(turns)
     expected = Rotation.from_rotvec(turns[0]).apply(bar.vertices)
-    np.testing.assert_allclose(moved_bar.vertices, expected, atol=1e-12)
+    assert_allclose(moved_bar.vertices, expected, atol=1e-12)
 
 
 def test_a_bent_bar_is_a_piece_of_a_torus():
@@ -117,7 +118,7 @@ def test_a_bent_bar_is_a_piece_of_a_torus():
     end = bent.vertices[cap] - bent.vertices[cap].mean(axis=0)
     flat = bar.vertices[cap] - bar.vertices[cap].mean(axis=0)
     turned = Rotation.from_rotvec([np.radians(degrees), 0, 0])
-    np.testing.assert_allclose(end, turned.apply(flat), atol=1e-9)
+    assert_allclose(end, turned.apply(flat), atol=1e-9)
 
 
 def test_a_hinge_keeps_lengths_near_both_bones():
@@ -137,11 +138,11 @@ def test_a_hinge_keeps_lengths_near_both_bones():
     assert len(outside) > 1000
     before = np.linalg.norm(np.diff(bar.vertices[outside], axis=1), axis=2)
     after = np.linalg.norm(np.diff(bent[outside], axis=1), axis=2)
-    np.testing.assert_allclose(after, before, rtol=1e-9)
+    assert_allclose(after, before, rtol=1e-9)
     top = z > 1.85
     joint = np.array([0, 0, 1.5])
     expected = Rotation.from_rotvec([1.2, 0, 0]).apply(bar.vertices[top] - joint) + joint
-    np.testing.assert_allclose(bent[top], expected, atol=1e-12)
+    assert_allclose(bent[top], expected, atol=1e-12)
 
 
 def test_weights_are_shares_and_follow_the_nearest_rod():
@@ -158,7 +159,7 @@ def test_weights_are_shares_and_follow_the_nearest_rod():
     both = trimesh.util.concatenate([bar, ball])
     solids = [bone.placed for bone in bones]
     binding = bind(np.asarray(both.vertices), np.asarray(both.faces), rig, solids)
-    np.testing.assert_allclose(binding.weights.sum(axis=1), 1.0)
+    assert_allclose(binding.weights.sum(axis=1), 1.0)
     assert (binding.weights >= 0.0).all()
     z = bar.vertices[:, 2]
     weights = binding.weights[: len(z)]
@@ -169,7 +170,7 @@ def test_weights_are_shares_and_follow_the_nearest_rod():
     middle = (z > 0.8) & (z < 1.3)
     found = binding.arc_lengths[: len(z)][middle, 2]
     expected = z[middle] - 0.3
-    np.testing.assert_allclose(found, expected, atol=0.02)
+    assert_allclose(found, expected, atol=0.02)
     # From the hub to the arm the weights go over without a step.
     levels = np.unique(z.round(9))
     mean = np.array([weights[np.isclose(z, level), 2].mean() for level in levels])

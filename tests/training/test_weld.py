@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from docs.benchmarks.weld import TUBE_FACES, facing_vertices, weld, weld_gap
+from numpy.linalg import norm
 from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
@@ -58,7 +59,7 @@ def test_weld_adds_a_handle_and_nothing_else():
     assert f"vertices {a} and {b}" in welded.notes[-1]
     # The way from one end to the other is now as long as the gap, no more once around the ring.
     assert paths(mesh)[a, b] > 5
-    assert paths(welded)[a, b] < 5 * np.linalg.norm(mesh.vertices[a] - mesh.vertices[b])
+    assert paths(welded)[a, b] < 5 * norm(mesh.vertices[a] - mesh.vertices[b])
 
 
 def test_weld_takes_the_shortest_tube():
@@ -70,10 +71,10 @@ def test_weld_takes_the_shortest_tube():
     for one, (p, q, r) in itertools.product(*at):
         for turned in ((r, q, p), (q, p, r), (p, r, q)):
             sides = mesh.vertices[one] - mesh.vertices[list(turned)]
-            lengths.append(np.linalg.norm(sides, axis=1).sum())
+            lengths.append(norm(sides, axis=1).sum())
     tube = weld(mesh, a, b).faces[-TUBE_FACES:]
     ends = mesh.vertices[tube[1::2][:, [0, 2]]]
-    found = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum()
+    found = norm(ends[:, 0] - ends[:, 1], axis=1).sum()
     expected = pytest.approx(min(lengths))
     assert found == expected
 
@@ -105,11 +106,11 @@ def test_facing_vertices_are_the_best_of_all_pairs(make, largest_gap, least_path
     sums = np.zeros_like(mesh.vertices)
     for corner in mesh.faces.T:
         np.add.at(sums, corner, areas)
-    unit = sums / np.linalg.norm(sums, axis=1, keepdims=True)
+    unit = sums / norm(sums, axis=1, keepdims=True)
     found = vertex_normals(mesh.vertices, mesh.faces)
     np.testing.assert_allclose(found, unit, atol=1e-12)
     way = mesh.vertices[None, :] - mesh.vertices[:, None]
-    gap = np.linalg.norm(way, axis=2) + np.eye(len(way))
+    gap = norm(way, axis=2) + np.eye(len(way))
     along = paths(mesh)
     facing = np.einsum("ik,ijk->ij", unit, way / gap[..., None]) > 0.5
     allowed = facing & facing.T & (gap <= largest_gap * mesh.diagonal)
@@ -134,6 +135,6 @@ def test_homer_is_welded_at_the_feet(homer):
     pair = homer.vertices[list(facing_vertices(homer))]
     height = (pair[:, 1] - homer.vertices[:, 1].min()) / np.ptp(homer.vertices[:, 1])
     assert (height < 0.1).all()
-    found = np.linalg.norm(pair[0] - pair[1])
+    found = norm(pair[0] - pair[1])
     expected = pytest.approx(0.0096, abs=5e-4)
     assert found == expected

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from one_body import of_mesh
 from scipy.spatial.distance import cdist
 from scipy.stats import special_ortho_group
@@ -70,21 +73,21 @@ def test_the_geodesics_of_the_rolled_up_sheet_are_straight_when_flat():
     source = 5 * 17 + 3
     distances = geodesic_distances(sheet(2.0), [source])[0][: 33 * 17]
     flat = sheet(0.0).vertices[: 33 * 17]
-    expected = np.linalg.norm(flat - flat[source], axis=1)
-    np.testing.assert_allclose(distances, expected, rtol=0.05, atol=0.02)
+    expected = norm(flat - flat[source], axis=1)
+    assert_allclose(distances, expected, rtol=0.05, atol=0.02)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_points_of_space_come_back(dimension):
-    points = np.random.default_rng(0).normal(size=(40, dimension)) * [3, 2, 1][:dimension]
+    points = default_rng(0).normal(size=(40, dimension)) * [3, 2, 1][:dimension]
     distances = cdist(points, points)
     form = classical_scaling(distances)
     assert form.shape == (40, 3)
-    np.testing.assert_allclose(cdist(form, form), distances, atol=1e-6)
+    assert_allclose(cdist(form, form), distances, atol=1e-6)
     found = form.mean(axis=0)
-    np.testing.assert_allclose(found, 0, atol=1e-6)
+    assert_allclose(found, 0, atol=1e-6)
     refined = least_squares_scaling(distances, form)
-    np.testing.assert_allclose(cdist(refined, refined), distances, atol=1e-6)
+    assert_allclose(cdist(refined, refined), distances, atol=1e-6)
 
 
 def test_least_squares_equals_scikit_learn(sphere):
@@ -107,11 +110,11 @@ def test_least_squares_equals_scikit_learn(sphere):
     assert before > 1.5 * ours
     found = cdist(form, form)
     expected = cdist(reference, reference)
-    np.testing.assert_allclose(found, expected, atol=0.02)
+    assert_allclose(found, expected, atol=0.02)
 
 
 def test_no_step_raises_the_stress():
-    generator = np.random.default_rng(1)
+    generator = default_rng(1)
     distances = cdist(*[generator.normal(size=(25, 6))] * 2)
     start = generator.normal(size=(25, 3))
     start[3] = start[4]  # coincident points must not divide by zero
@@ -138,7 +141,7 @@ def test_moments_of_a_box_by_closed_form():
 def test_distances_ignore_reflections_but_not_their_mixture():
     descriptor = CanonicalForm()
     powers = exponents(4)
-    form = np.random.default_rng(0).gamma(2.0, size=(60, 3)) * [3, 2, 1]
+    form = default_rng(0).gamma(2.0, size=(60, 3)) * [3, 2, 1]
     described = moments(form, 4).astype(np.float32)
     for flips in product((1, -1), repeat=3):
         reflected = (described * np.prod(np.array(flips) ** powers, axis=1)).astype(np.float32)
@@ -148,11 +151,11 @@ def test_distances_ignore_reflections_but_not_their_mixture():
     changed[np.flatnonzero((powers == [3, 0, 0]).all(axis=1))] *= -1
     assert distance(described, changed, descriptor) > 0.1
     # The least over the reflections, by a loop.
-    other = moments(np.random.default_rng(1).gamma(2.0, size=(60, 3)), 4).astype(np.float32)
+    other = moments(default_rng(1).gamma(2.0, size=(60, 3)), 4).astype(np.float32)
     apart = []
     for flips in product((1, -1), repeat=3):
         signs = np.prod(np.array(flips) ** powers, axis=1)
-        apart.append(np.linalg.norm(described * signs - other))
+        apart.append(norm(described * signs - other))
     loop = min(apart)
     assert distance(described, other, descriptor) == pytest.approx(loop, rel=1e-6)
     assert distance(other, described, descriptor) == pytest.approx(loop, rel=1e-6)
@@ -166,8 +169,8 @@ def test_the_form_is_that_of_least_squares(blob):
     found = descriptor.describe_body(of_mesh(blob))
     # the signs of the axes are arbitrary, and rounding decides them: the distance takes the best reflection
     fitted, plain = (distance(found.astype(float), form, descriptor) for form in forms)
-    assert fitted < 1e-6 * np.linalg.norm(forms[0])
-    assert plain > 1e-2 * np.linalg.norm(forms[1])
+    assert fitted < 1e-6 * norm(forms[0])
+    assert plain > 1e-2 * norm(forms[1])
 
 
 def test_parameters_are_checked(blob):
@@ -183,8 +186,8 @@ def test_parameters_are_checked(blob):
 def test_the_numbers_of_vertices_do_not_matter(blob):
     # Simplified too, which is where ties could be broken by numbers.
     descriptor = CanonicalForm(max_vertices=400)
-    order = np.random.default_rng(3).permutation(len(blob.vertices))
+    order = default_rng(3).permutation(len(blob.vertices))
     renumbered = Mesh(blob.vertices[order], np.argsort(order)[blob.faces][::-1])
     expected = descriptor.describe_body(of_mesh(blob))
     found = descriptor.describe_body(of_mesh(renumbered))
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+    assert_allclose(found, expected, rtol=1e-4, atol=1e-6)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.testing import assert_allclose
 from one_body import of_mesh
 from scipy.special import eval_legendre
 from scipy.stats import special_ortho_group
@@ -31,7 +32,7 @@ def test_eigenvalues_of_great_circles(sphere):
     expected = sphere_eigenvalues(16)
     assert expected[0] > 5 * expected[1] > 0
     assert expected[1] == pytest.approx(expected[3])
-    np.testing.assert_allclose(affinity_eigenvalues(distances, 16), expected, atol=1e-3)
+    assert_allclose(affinity_eigenvalues(distances, 16), expected, atol=1e-3)
 
 
 def test_description_of_the_sphere(sphere):
@@ -40,14 +41,14 @@ def test_description_of_the_sphere(sphere):
     assert described.shape == (9,)
     assert described.dtype == np.float32
     expected = np.sqrt(np.abs(sphere_eigenvalues(9)))
-    np.testing.assert_allclose(described, expected, atol=0.02)
+    assert_allclose(described, expected, atol=0.02)
 
 
 def test_eigenvalues_of_two_and_of_equidistant_points():
     # exp(−½) everywhere but on the diagonal: (1 + (n − 1) e^−½) / n once, (1 − e^−½) / n otherwise.
     distances = 3.0 * (1 - np.eye(5))
     expected = np.array([1 + 4 * np.exp(-0.5)] + [1 - np.exp(-0.5)] * 4) / 5
-    np.testing.assert_allclose(affinity_eigenvalues(distances, 5), expected)
+    assert_allclose(affinity_eigenvalues(distances, 5), expected)
 
 
 def test_trace_is_one(blob):
@@ -65,7 +66,7 @@ def test_motion_scale_and_bending(blob):
     described = descriptor.describe_body(of_mesh(blob))
     turn = special_ortho_group.rvs(3, random_state=1) * 2.5
     moved = descriptor.describe_body(of_mesh(Mesh(blob.vertices @ turn + 3, blob.faces)))
-    np.testing.assert_allclose(moved, described, rtol=1e-5)
+    assert_allclose(moved, described, rtol=1e-5)
     # A bent tube stays close to the straight one, and a sphere is far.
     straight, bent = (_tube(angle) for angle in (0.0, 2.0))
     ball = as_mesh(trimesh.creation.icosphere(subdivisions=3))
@@ -120,4 +121,4 @@ def test_the_numbers_of_vertices_do_not_matter(blob):
     renumbered = Mesh(blob.vertices[order], np.argsort(order)[blob.faces][::-1])
     expected = descriptor.describe_body(of_mesh(blob))
     found = descriptor.describe_body(of_mesh(renumbered))
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert_allclose(found, expected, rtol=1e-5)

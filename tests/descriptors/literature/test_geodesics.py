@@ -2,6 +2,7 @@ import igl
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 from shortest_paths import farthest_points, geodesic_distances
 
 from conftest import as_mesh
@@ -22,7 +23,7 @@ def test_never_shorter_than_the_exact_polyhedral_distance(blob):
         reference = exact(blob, source)
         distances = geodesic_distances(blob, [source])[0]
         assert (distances >= reference - 1e-12).all()
-        np.testing.assert_allclose(distances, reference, rtol=0.05)
+        assert_allclose(distances, reference, rtol=0.05)
 
 
 def test_thin_triangles_do_no_harm():
@@ -30,14 +31,12 @@ def test_thin_triangles_do_no_harm():
     needles = as_mesh(cube)
     distances = geodesic_distances(needles, [0])[0]
     reference = exact(needles, 0)
-    np.testing.assert_allclose(distances, reference, atol=0.03 * reference.max())
+    assert_allclose(distances, reference, atol=0.03 * reference.max())
 
 
 def test_farthest_points_are_greedy(blob):
     samples = farthest_points(blob, 30)
-    np.testing.assert_allclose(
-        samples.distances, geodesic_distances(blob, samples.vertices), rtol=1e-12
-    )
+    assert_allclose(samples.distances, geodesic_distances(blob, samples.vertices), rtol=1e-12)
     for i in range(1, 30):
         nearest = samples.distances[:i].min(axis=0)
         assert nearest[samples.vertices[i]] == nearest.max()
@@ -48,9 +47,9 @@ def test_farthest_points_are_greedy(blob):
     expected = pytest.approx(length, rel=1e-12)
     assert found == expected
     assert length > 0.95 * everywhere.max()
-    np.testing.assert_array_equal(samples.mutual, samples.mutual.T)
+    assert_array_equal(samples.mutual, samples.mutual.T)
     expected = samples.distances[:, samples.vertices]
-    np.testing.assert_allclose(samples.mutual, expected, rtol=1e-12)
+    assert_allclose(samples.mutual, expected, rtol=1e-12)
 
 
 def renumbered(mesh, seed):
@@ -70,7 +69,7 @@ def test_farthest_points_do_not_depend_on_numbers(blob):
         mesh, new = renumbered(blob, seed)
         found = farthest_points(mesh, 60).vertices
         expected = new[samples.vertices]
-        np.testing.assert_array_equal(found, expected)
+        assert_array_equal(found, expected)
 
 
 def test_rounding_does_not_decide_between_equally_far_points():
@@ -81,4 +80,4 @@ def test_rounding_does_not_decide_between_equally_far_points():
     for number, factor in enumerate((0.1, 1 / 3, 7.7)):
         moved, _ = renumbered(Mesh(mesh.vertices * factor + factor, mesh.faces), number)
         found = np.sort(farthest_points(moved, 40).mutual, axis=None)
-        np.testing.assert_allclose(found, factor * expected, rtol=1e-9)
+        assert_allclose(found, factor * expected, rtol=1e-9)

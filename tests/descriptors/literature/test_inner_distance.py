@@ -3,6 +3,8 @@ from math import gcd
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
 from one_body import of_signature
 from scipy.sparse.csgraph import floyd_warshall
 from scipy.spatial import ConvexHull
@@ -23,7 +25,7 @@ def block(x, y, z):
 
 
 def index_of(points, point):
-    return int(np.argmin(np.linalg.norm(points - point, axis=1)))
+    return int(np.argmin(norm(points - point, axis=1)))
 
 
 def every(points):
@@ -44,7 +46,7 @@ def links_by_looking(points):
             continue
         on_the_way = {tuple(int(k) for k in np.round(p + t * (q - p))) for t in steps}
         if offset.max() == 1 or on_the_way <= cells:
-            links[i, j] = np.linalg.norm(q - p)
+            links[i, j] = norm(q - p)
     return links
 
 
@@ -52,7 +54,7 @@ def test_bound_is_that_of_the_98_directions():
     steps = np.array([s for s in product(range(-2, 3), repeat=3) if gcd(*s) == 1], dtype=float)
     assert len(steps) == 98
     # A path made of the steps is longest for its span where the hull of the unit steps is nearest to the origin.
-    hull = ConvexHull(steps / np.linalg.norm(steps, axis=1, keepdims=True))
+    hull = ConvexHull(steps / norm(steps, axis=1, keepdims=True))
     inradius = -hull.equations[:, 3].max()
     assert 1 / inradius <= METRICATION < 1 / inradius + 1e-3
 
@@ -63,7 +65,7 @@ def test_box_has_euclidean_distances_within_the_bound():
     straight = cdist(points, points)
     assert (inner >= straight - 1e-12).all()
     assert (inner <= METRICATION * straight + 1e-12).all()
-    np.testing.assert_allclose(inner, inner.T, atol=1e-12)
+    assert_allclose(inner, inner.T, atol=1e-12)
 
 
 def test_random_cells_equal_floyd_and_warshall():
@@ -71,7 +73,7 @@ def test_random_cells_equal_floyd_and_warshall():
     points = block(6, 5, 5)[generator.random(150) < 0.45]
     expected = floyd_warshall(links_by_looking(points))
     assert np.isfinite(expected).all(), "the oracle knows no pieces"
-    np.testing.assert_allclose(every(points), expected, rtol=1e-12)
+    assert_allclose(every(points), expected, rtol=1e-12)
 
 
 def test_path_goes_round_the_corner_of_an_l():
@@ -98,14 +100,14 @@ def test_chain_of_single_cells_is_walked_along():
     points = np.array([[0, 0, 0], [3, 0, 0], [7, 0, 0], [7, 5, 0], [7, 5, 1]], dtype=float)
     found = inner_distances(points, np.array([0]))[0]
     expected = [0, 3, 7, 12, 13]
-    np.testing.assert_allclose(found, expected)
+    assert_allclose(found, expected)
 
 
 def test_cell_is_found_where_no_two_samples_are_neighbours():
     points = np.array([[0, 0, 0], [2, 0, 0], [5, 0, 0]]) * 0.1 + 0.7
     found = inner_distances(points, np.array([0]))[0]
     expected = [0, 0.2, 0.5]
-    np.testing.assert_allclose(found, expected)
+    assert_allclose(found, expected)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +137,7 @@ def test_histogram_equals_a_loop_over_all_pairs():
     assert n_beyond
     histogram = descriptor.describe_body(body_of(points, area))
     assert histogram.dtype == np.float32
-    np.testing.assert_allclose(histogram, expected / expected.sum(), atol=1e-6)
+    assert_allclose(histogram, expected / expected.sum(), atol=1e-6)
 
 
 def test_few_sources_estimate_the_whole():

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.testing import assert_allclose
 from one_body import of_mesh
 
 from conftest import as_mesh
@@ -70,7 +71,7 @@ def test_rays_that_leave_through_a_hole_do_not_count(sphere):
     assert np.isnan(diameters[height < -0.95]).all()
     beside = diameters[np.abs(height) < 0.05]
     expected = 1 + np.cos(np.radians(10))
-    np.testing.assert_allclose(beside, expected, rtol=0.02)
+    assert_allclose(beside, expected, rtol=0.02)
 
 
 def test_surface_that_no_ray_meets_again_is_refused(sphere):
@@ -92,7 +93,7 @@ def test_centricity_of_a_thin_tube_rises_from_a_quarter_to_half_its_length():
     values = centricity(mesh, 200)
     z = mesh.vertices[:, 2]
     # The mean distance from a point z of a stick of length L is L/4 + z²/L.
-    np.testing.assert_allclose(values, 5 + z**2 / 20, rtol=0.03)
+    assert_allclose(values, 5 + z**2 / 20, rtol=0.03)
 
 
 def test_sources_are_a_quadrature_of_the_whole_surface(blob):
@@ -176,4 +177,4 @@ def test_numbers_of_vertices_and_faces_do_not_matter(blob):
     descriptor = LocalDiameterCentricity(n_samples=300)
     expected = descriptor.describe_body(of_mesh(blob))
     found = descriptor.describe_body(of_mesh(Mesh(blob.vertices[order], np.roll(faces, 1, axis=1))))
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(found, expected, atol=1e-6)

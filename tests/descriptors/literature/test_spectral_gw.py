@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from one_body import of_signature
 from scipy.optimize import linprog
 from scipy.special import eval_legendre
@@ -58,16 +59,16 @@ def test_heat_kernel_of_the_sphere(round_signature):
         assert kernel.shape == (400, 400)
         largest = sphere_kernel(np.ones(1), time)[0]
         expected = sphere_kernel(cosine, time)
-        np.testing.assert_allclose(kernel, expected, atol=0.02 * largest)
+        assert_allclose(kernel, expected, atol=0.02 * largest)
 
 
 def test_quantile_means_by_hand():
     found = quantiles([3.0, 1.0], 4)
     expected = [1, 1, 3, 3]
-    np.testing.assert_allclose(found, expected)
-    np.testing.assert_allclose(quantiles([4.0, 1.0, 1.0], 2), [1, 3])  # 1 on [½, ⅔], 4 on [⅔, 1]
+    assert_allclose(found, expected)
+    assert_allclose(quantiles([4.0, 1.0, 1.0], 2), [1, 3])  # 1 on [½, ⅔], 4 on [⅔, 1]
     found = quantiles([[5.0, 2.0]], 1)
-    np.testing.assert_allclose(found, [3.5])
+    assert_allclose(found, [3.5])
 
 
 def test_quantiles_give_the_wasserstein_distance():
@@ -119,7 +120,7 @@ def test_signs_multiplets_and_scale(blob_signature):
     signs = np.where(np.arange(100) % 3, 1, -1)
     surface = blob_signature.surface
     turned = with_surface(blob_signature, surface.points, surface.eigenfunctions * signs)
-    np.testing.assert_array_equal(descriptor.describe_body(of_signature(turned)), described)
+    assert_array_equal(descriptor.describe_body(of_signature(turned)), described)
     scaled = Signature(
         blob_signature.eigenvalues / 9,
         blob_signature.interior,
@@ -129,7 +130,7 @@ def test_signs_multiplets_and_scale(blob_signature):
         blob_signature.config,
     )
     found = descriptor.describe_body(of_signature(scaled))
-    np.testing.assert_allclose(found, described, rtol=1e-5, atol=1e-6 * described.max())
+    assert_allclose(found, described, rtol=1e-5, atol=1e-6 * described.max())
 
 
 def test_few_samples_and_the_draw(blob_signature):
@@ -141,7 +142,7 @@ def test_few_samples_and_the_draw(blob_signature):
         )
         for seed in (0, 0, 1)
     )
-    np.testing.assert_array_equal(a, b)
+    assert_array_equal(a, b)
     assert (a != c).any()
 
 

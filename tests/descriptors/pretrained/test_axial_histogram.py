@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 from batches import alone, embedded, scaled, two_bodies
 from igps.data.requirements import Requirements
@@ -59,7 +61,7 @@ def test_it_is_the_share_of_samples_in_each_cell():
                     hat(direction @ aside / distance, outward),
                 ]
                 expected[k] += np.einsum("a,b,c,d->abcd", *cells)
-        np.testing.assert_allclose(found[i], expected / (3 * len(points)), atol=1e-6)
+        assert_allclose(found[i], expected / (3 * len(points)), atol=1e-6)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -71,7 +73,7 @@ def test_neither_motion_nor_reflection_nor_scale_change_it(mirrored):
         motion = -motion
     expected = histogram(batch)
     found = histogram(scaled(moved(batch, motion, torch.tensor([1.0, -2.0, 0.5])), 2.0))
-    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+    assert_close(found, expected, atol=1e-4, rtol=0)
 
 
 def test_padding_changes_nothing():
@@ -79,9 +81,9 @@ def test_padding_changes_nothing():
     histogram = AxialHistogram(EMBEDDING)
     found = histogram(batch)
     expected = torch.ones(2)
-    torch.testing.assert_close(found.flatten(1).sum(dim=1), expected)
+    assert_close(found.flatten(1).sum(dim=1), expected)
     for i in range(2):
-        torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
+        assert_close(histogram(alone(batch, i))[0], found[i])
 
 
 def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end():
@@ -95,10 +97,10 @@ def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end(
     weights[len(brick) :] = 1e-9  # what is far off tells the direction, not the axes
     (centre,), (axes,) = principal_axes(points[None], weights[None])
     expected = [7, 7, 7]
-    np.testing.assert_allclose(centre[0], expected, atol=0.05)
+    assert_allclose(centre[0], expected, atol=0.05)
     found = (turn.T @ axes).abs()
     expected = np.eye(3)[[1, 2, 0]].T
-    np.testing.assert_allclose(found, expected, atol=0.05)
+    assert_allclose(found, expected, atol=0.05)
     assert float((turn.T @ axes)[1, 0]) < -0.99
 
 

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
+from torch.testing import assert_close
 
 from batches import alone, batch_of, embedded, scaled, two_bodies
 from igps.data.requirements import Requirements
@@ -66,7 +68,7 @@ def test_branches_are_as_long_as_pieces_stay_apart():
         lengths += [height - heights.min() for height in living.values()]
         expected = np.sort(lengths)[::-1][:4]
         expected = np.pad(expected, (0, 4 - len(expected)))
-        np.testing.assert_allclose(found[i], expected / expected.sum(), atol=1e-5)
+        assert_allclose(found[i], expected / expected.sum(), atol=1e-5)
 
 
 def test_pieces_count_by_their_sizes_and_lengths():
@@ -94,7 +96,7 @@ def test_pieces_count_by_their_sizes_and_lengths():
                 row = hat(float(np.log2(size)), sizes)
                 column = hat(float(np.log2(length)), lengths)
                 expected[level] += len(piece) * np.outer(row, column)
-        np.testing.assert_allclose(found[i], expected / expected.sum(), atol=1e-5)
+        assert_allclose(found[i], expected / expected.sum(), atol=1e-5)
 
 
 def star(n_arms, length, seed):
@@ -119,7 +121,7 @@ def test_pieces_of_a_star_are_its_arms():
     histogram = PieceHistogram((180 / 380,), SpectralEmbedding(), n_bins=(6, 5))
     found = histogram(star(3, 1.0, seed=3))[0, 0]
     of_sizes = np.array(hat(float(np.log2(60 / 380)), np.linspace(-6, -0.5, 6).tolist()))
-    np.testing.assert_allclose(found.sum(dim=1), of_sizes, atol=0.02)
+    assert_allclose(found.sum(dim=1), of_sizes, atol=0.02)
     assert float(found[:, 3:].sum()) > 0.9  # rods
 
 
@@ -130,10 +132,10 @@ def test_padding_and_scale_change_nothing(make):
     found = histogram(batch)
     assert found.shape == (2, *histogram.shape)
     expected = torch.ones(2)
-    torch.testing.assert_close(found.flatten(1).sum(dim=1), expected)
+    assert_close(found.flatten(1).sum(dim=1), expected)
     for i in range(2):
-        torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
-    torch.testing.assert_close(histogram(scaled(batch, 3.0)), found, atol=1e-5, rtol=0)
+        assert_close(histogram(alone(batch, i))[0], found[i])
+    assert_close(histogram(scaled(batch, 3.0)), found, atol=1e-5, rtol=0)
 
 
 @BOTH
@@ -144,7 +146,7 @@ def test_the_order_of_samples_changes_nothing(make):
     surface = batch.surface
     other = surface.map(lambda values: values[:, order])
     found = histogram(replace(batch, surface=other))
-    torch.testing.assert_close(found, histogram(batch))
+    assert_close(found, histogram(batch))
 
 
 @BOTH
@@ -152,17 +154,17 @@ def test_a_subset_of_the_samples_is_told(make):
     batch = two_bodies()
     expected = make(embedding=EMBEDDING)(replace(batch, surface=batch.surface.subset(20, seed=0)))
     found = make(embedding=EMBEDDING, n_samples=20)(batch)
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     interior = make(embedding=EMBEDDING, samples="interior")(batch)
     expected = make(embedding=EMBEDDING)(replace(batch, surface=batch.interior))
-    torch.testing.assert_close(interior, expected)
+    assert_close(interior, expected)
 
 
 @BOTH
 def test_a_body_that_is_the_same_everywhere_is_one_piece(make):
     same = batch_of(torch.ones(1, 10, 3), points=torch.ones(1, 10, 3))
     found = make()(same)
-    torch.testing.assert_close(found.sum(), torch.tensor(1.0))
+    assert_close(found.sum(), torch.tensor(1.0))
     assert torch.isfinite(found).all()
     if make is BranchHistogram:
         assert found[0, 0] == 1

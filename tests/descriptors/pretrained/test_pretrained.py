@@ -7,6 +7,7 @@ import torch
 import trimesh
 from safetensors.torch import load_file, save_file
 from torch.nn.functional import normalize
+from torch.testing import assert_close
 from training.pretrain import save_pretrained
 from training.shapes import GradedShapes
 
@@ -60,15 +61,13 @@ def test_rich_is_its_histograms_side_by_side_with_equal_shares(dataset, histogra
     with torch.inference_mode():
         for part in found.parts:
             expected += [histogram(batch).flatten(1) / (3 * len(part)) for histogram in part]
-    torch.testing.assert_close(histograms[[0, 7]], torch.cat(expected, dim=1), rtol=1e-4, atol=1e-7)
+    assert_close(histograms[[0, 7]], torch.cat(expected, dim=1), rtol=1e-4, atol=1e-7)
     for part in histograms.split(CELLS, dim=1):
-        torch.testing.assert_close(
-            part.sum(dim=1), torch.full((len(part),), 1 / 3), rtol=1e-4, atol=0
-        )
+        assert_close(part.sum(dim=1), torch.full((len(part),), 1 / 3), rtol=1e-4, atol=0)
     # The distance of the whole is then the mean of those of the parts, each a histogram of sum 1.
     of_parts = [chi_square(3 * part, 3 * part) for part in histograms.split(CELLS, dim=1)]
     whole = found.distances(histograms, histograms)
-    torch.testing.assert_close(whole, torch.stack(of_parts).mean(dim=0), rtol=1e-4, atol=1e-6)
+    assert_close(whole, torch.stack(of_parts).mean(dim=0), rtol=1e-4, atol=1e-6)
 
 
 def test_a_class_is_closer_to_itself(dataset, histograms):
@@ -111,7 +110,7 @@ def test_pretrained_is_what_its_parameters_say(dataset):
     found = describe(part, module)
     of_bodies = [(share / 2).sqrt() * one for one in bodies]
     expected = torch.cat([(1 - share).sqrt() * classes, *of_bodies], dim=1)
-    torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
+    assert_close(found.double(), expected, atol=1e-4, rtol=0)
     from_mean = torch.stack([one[:, :-1].square().sum(dim=1) for one in bodies]).mean(dim=0).sqrt()
     shorter = (torch.outer(from_mean, from_mean).sqrt() / (0.5 / 2**0.5)).sqrt()
     exponent = torch.zeros(4, 4, dtype=torch.float64)
@@ -123,9 +122,7 @@ def test_pretrained_is_what_its_parameters_say(dataset):
     differ = (1 - torch.exp(-exponent)) * (1 - torch.exp(-((between / 0.1) ** 20)))
     distances = 0.95 * (1 - classes @ classes.T) * differ
     distances += 0.05 * (1 - torch.exp(-((between / 0.1) ** 2)))
-    torch.testing.assert_close(
-        module.distances(found, found).double(), distances, atol=2e-3, rtol=0
-    )
+    assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
 
 
 def test_pretrained_gives_unit_vectors_and_short_ones(dataset):
@@ -137,7 +134,7 @@ def test_pretrained_gives_unit_vectors_and_short_ones(dataset):
     assert short.shape == (len(dataset), 256)
     for vectors in (found, short):
         expected = torch.ones(len(dataset))
-        torch.testing.assert_close(vectors.norm(dim=1), expected, atol=1e-5, rtol=0)
+        assert_close(vectors.norm(dim=1), expected, atol=1e-5, rtol=0)
     whole, of_short = (
         retrieval_scores(cosine(one, one), dataset.labels).mean()["ft"] for one in (found, short)
     )
@@ -176,7 +173,7 @@ def test_a_head_of_ones_own_is_stored_and_loaded(dataset, tmp_path):
     loaded = pretrained(tmp_path / "head.safetensors")
     assert not loaded.training
     found = describe(dataset, loaded)
-    torch.testing.assert_close(found, head(described), atol=5e-3, rtol=0)
+    assert_close(found, head(described), atol=5e-3, rtol=0)
     shipped = pretrained().head(described)
     assert shipped.shape[1] != head(described).shape[1] or not torch.allclose(
         shipped, head(described), atol=0.1
@@ -200,9 +197,7 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_nu
 
     leaf = places.clone().requires_grad_()
     expected = (torch.autograd.grad(loss(leaf), leaf)[0] * along).sum()
-    torch.testing.assert_close(
-        torch.func.jvp(loss, (places,), (along,))[1], expected, rtol=1e-6, atol=0
-    )
+    assert_close(torch.func.jvp(loss, (places,), (along,))[1], expected, rtol=1e-6, atol=0)
     assert torch.isfinite(torch.func.jvp(torch.func.grad(loss), (places,), (along,))[1]).all()
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from batches import N_EIGENPAIRS, alone, scaled, two_bodies
 from igps.data.requirements import Requirements
@@ -22,7 +23,7 @@ def test_shares_are_those_of_a_loop():
         radius = (3 * float(batch.volume[i]) / (4 * math.pi)) ** (1 / 3)
         shares = [float(batch.eigenvalues[i, k - 1]) * radius**2 / (2 * k) / 6 for k in range(1, 7)]
         expected = torch.tensor([*shares, 1 - sum(shares)])
-        torch.testing.assert_close(found[i], expected)
+        assert_close(found[i], expected)
 
 
 def test_a_spectrum_that_follows_weyl_has_equal_shares():
@@ -31,9 +32,7 @@ def test_a_spectrum_that_follows_weyl_has_equal_shares():
     line = 4 * torch.pi * torch.arange(1, 13, dtype=torch.float64) / batch.area[:, None]
     found = SpectrumShares(12)(replace(batch, eigenvalues=line))
     own = 4 * torch.pi * (3 * batch.volume / (4 * torch.pi)) ** (2 / 3) / batch.area
-    torch.testing.assert_close(
-        found[:, :12].double(), (own / 24)[:, None].expand(2, 12), atol=1e-7, rtol=0
-    )
+    assert_close(found[:, :12].double(), (own / 24)[:, None].expand(2, 12), atol=1e-7, rtol=0)
 
 
 def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off():
@@ -41,8 +40,8 @@ def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off():
     part = SpectrumShares(min(N_EIGENPAIRS))
     found = part(replace(batch, eigenvalues=1e3 * batch.eigenvalues))
     expected = part(batch)[:, :-1]
-    torch.testing.assert_close(found[:, :-1], expected / expected.sum(dim=1, keepdim=True))
-    torch.testing.assert_close(found[:, -1], torch.zeros(2), atol=1e-6, rtol=0)
+    assert_close(found[:, :-1], expected / expected.sum(dim=1, keepdim=True))
+    assert_close(found[:, -1], torch.zeros(2), atol=1e-6, rtol=0)
 
 
 def test_padding_and_scale_change_nothing():
@@ -50,10 +49,10 @@ def test_padding_and_scale_change_nothing():
     histogram = SpectrumShares(min(N_EIGENPAIRS))
     found = histogram(batch)
     expected = torch.ones(2)
-    torch.testing.assert_close(found.sum(dim=1), expected)
+    assert_close(found.sum(dim=1), expected)
     for i in range(2):
-        torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
-    torch.testing.assert_close(histogram(scaled(batch, 3.0)), found)
+        assert_close(histogram(alone(batch, i))[0], found[i])
+    assert_close(histogram(scaled(batch, 3.0)), found)
 
 
 def test_needs_and_what_is_refused():

@@ -12,6 +12,7 @@ import nibabel
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_array_equal
 
 from igps import SignatureConfig, compute_signature
 from igps.fields.meshes.stl import merged
@@ -193,7 +194,7 @@ def expected(tmp_path_factory):
 def test_every_format_gives_the_same_signature_to_the_byte(name, tmp_path, expected):
     WRITERS[name](tmp_path / name)
     mesh = load_mesh(tmp_path / name, LoadOptions("never"))
-    np.testing.assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
+    assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
     assert len(mesh.vertices) == len(VERTICES)
     assert mesh.notes == ()
     assert mesh.unit == UNITS.get(Path(name).suffix)
@@ -208,7 +209,7 @@ def test_a_binary_stl_with_a_wrong_count_gives_what_is_there(tmp_path):
         content[80:84] = count.to_bytes(4, "little")
         path.write_bytes(content + b"\0" * 7)
         mesh = load_mesh(path)
-        np.testing.assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
+        assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
         assert mesh.notes == (f"the header declares {count} triangles: {len(FACES)} were read",)
     path.write_bytes(content[:100])
     with pytest.raises(MeshError, match=r"count\.stl: not readable as STL.*no triangle"):
@@ -220,9 +221,9 @@ def test_corners_in_one_place_are_one_vertex_in_the_order_in_which_they_come():
     # Zeros of both signs
     corners = generator.integers(-1, 2, (300, 3)) * generator.choice([1.0, -1.0], (300, 3))
     vertices, faces = merged(corners)
-    np.testing.assert_array_equal(vertices[faces.ravel()], corners)
+    assert_array_equal(vertices[faces.ravel()], corners)
     places = list(dict.fromkeys(map(tuple, corners.tolist())))
-    np.testing.assert_array_equal(vertices, places)
+    assert_array_equal(vertices, places)
 
 
 def test_volumes_of_cells_give_the_surface_around_them(tmp_path):
@@ -257,7 +258,7 @@ def test_a_strip_of_a_ply_file_turns_its_triangles_alike(tmp_path):
     (tmp_path / "a.ply").write_text(head + "0 0 0\n1 0 0\n0 1 0\n0 0 1\n9 1 0 2 3 1 0 -1 0 1\n")
     mesh = load_mesh(tmp_path / "a.ply", LoadOptions(mend="never"))
     strip = trimesh.util.triangle_strips_to_faces([[1, 0, 2, 3, 1, 0]])
-    np.testing.assert_array_equal(mesh.faces, strip)
+    assert_array_equal(mesh.faces, strip)
     assert mesh.volume == pytest.approx(1 / 6)
 
 
@@ -348,7 +349,7 @@ def test_one_long_number_does_not_widen_all_others(name, tmp_path):
     mesh = load_mesh(tmp_path / name)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    np.testing.assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
+    assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
     assert peak < 8e6
 
 
@@ -433,7 +434,7 @@ def test_concave_polygons_of_any_format_do_not_fold(name, tmp_path):
     content = polygon_files()[name]
     (tmp_path / name).write_bytes(content)
     mesh = load_mesh(tmp_path / name, LoadOptions(mend="never"))
-    np.testing.assert_array_equal(mesh.vertices, bracket()[0])
+    assert_array_equal(mesh.vertices, bracket()[0])
     assert mesh.volume == pytest.approx(10)
     assert mesh.area == pytest.approx(2 * 10 + 22)
     (tmp_path / name).write_bytes(content[: len(content) - len(content) // 8])
@@ -451,8 +452,8 @@ def test_squares_are_what_trimesh_makes_of_them(tmp_path):
     for path in tmp_path.iterdir():
         found = load_mesh(path)
         expected = trimesh.load(path, process=False)
-        np.testing.assert_array_equal(found.vertices, expected.vertices)
-        np.testing.assert_array_equal(found.faces, expected.faces)
+        assert_array_equal(found.vertices, expected.vertices)
+        assert_array_equal(found.faces, expected.faces)
 
 
 def test_files_are_known_by_the_longest_suffix_and_maps_on_surfaces_are_none():

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 import igps
@@ -30,14 +33,14 @@ SEPARATIONS = np.array([0, 1, 2, 3, 4, 5, 6.5, 9, 12.5, 17.5, 25, 37, 57, 89, 13
 
 def walk(seed: int, n: int = 150) -> Floats:
     """(n, 3) Å, a random chain with a step of 3.8 Å."""
-    steps = np.random.default_rng(seed).normal([0.3, 0, 0], size=(n, 3))
-    return np.cumsum(3.8 * steps / np.linalg.norm(steps, axis=1, keepdims=True), axis=0)
+    steps = default_rng(seed).normal([0.3, 0, 0], size=(n, 3))
+    return np.cumsum(3.8 * steps / norm(steps, axis=1, keepdims=True), axis=0)
 
 
 def directions_of(residues: Floats) -> Floats:
     """(n, 3) unit vectors along a chain without gaps, over three residues before and after."""
     vectors = [residues[i : i + 4][-1] - residues[max(i - 3, 0)] for i in range(len(residues))]
-    return np.array(vectors) / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.array(vectors) / norm(vectors, axis=1, keepdims=True)
 
 
 def signature(residues: Floats, places: Floats, nearest: NDArray[np.int64]) -> Signature:
@@ -55,12 +58,12 @@ def test_every_residue_counts_once_in_the_row_of_its_separation() -> None:
     residues = walk(0)
     places = np.arange(150.0)
     places[80:] += 20  # a gap
-    nearest = np.random.default_rng(1).integers(0, 150, N)
+    nearest = default_rng(1).integers(0, 150, N)
     nearest[:150] = np.arange(150)  # each at least once, some often
     found = fold()(collate([signature(residues, places, nearest)]))[0].double().numpy()
     i, j = np.triu_indices(150, 1)
     line = residues[j] - residues[i]
-    distance = np.linalg.norm(line, axis=1)
+    distance = norm(line, axis=1)
     one, other = directions_of(residues)[[i, j]]
     twist = (np.cross(one, other) * line).sum(axis=1) / distance
     separation = hats(np.abs(places[i] - places[j]), SEPARATIONS)[:, 2:]
@@ -74,7 +77,7 @@ def test_every_residue_counts_once_in_the_row_of_its_separation() -> None:
     weights = n_pairs / (n_pairs + 2000) / (1 + SEPARATIONS[2:] / 10)
     weights /= weights.sum() * n_pairs
     expected = wanted * weights[:, None, None, None]
-    np.testing.assert_allclose(found, expected, atol=2e-6)
+    assert_allclose(found, expected, atol=2e-6)
 
 
 def test_short_chains_have_no_far_pairs_and_padding_changes_nothing() -> None:
@@ -110,7 +113,7 @@ def test_shares_of_samples_add_up_to_the_distance() -> None:
 
 def test_residues_of_other_kinds_change_nothing() -> None:
     residues = walk(6, 30)
-    points = residues + np.random.default_rng(7).normal(size=(30, 3))
+    points = residues + default_rng(7).normal(size=(30, 3))
 
     def traced(name: str, motion: Floats) -> Floats:
         at = residues @ motion
@@ -121,17 +124,17 @@ def test_residues_of_other_kinds_change_nothing() -> None:
         )
         return residue_attribute(molecule, points @ motion, "trace")
 
-    turn = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))[0]
+    turn = np.linalg.qr(default_rng(8).normal(size=(3, 3)))[0]
     one = traced("GLY", np.eye(3))
     other = traced("TRP", np.eye(3))
     turned = traced("GLY", turn)
-    np.testing.assert_array_equal(one, other)
+    assert_array_equal(one, other)
     wanted = [one[:, :3] @ turn, one[:, 3:6] @ turn, one[:, 6]]
-    np.testing.assert_allclose(turned, np.column_stack(wanted), atol=1e-9)
+    assert_allclose(turned, np.column_stack(wanted), atol=1e-9)
     nearest = one[:, 6].astype(int)
     found = one[:, 3:6]
     expected = directions_of(residues)[nearest]
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert_allclose(found, expected, atol=1e-9)
 
 
 def test_places_follow_bonds_then_numbers_then_distances() -> None:
@@ -142,7 +145,7 @@ def test_places_follow_bonds_then_numbers_then_distances() -> None:
     chains = np.array(list("AAAAAABB"))
     found = chain_places(positions, numbers, chains)
     expected = [0, 1, 2, 11, 12, np.nan, 12 + BETWEEN_CHAINS, 13 + BETWEEN_CHAINS]
-    np.testing.assert_array_equal(found, expected)
+    assert_array_equal(found, expected)
     numbers[3] = 1002  # 20 Å apart: five steps at least must be missing, and 6 bridge them
     assert chain_places(positions, numbers, chains)[3] == 2 + 6
     assert np.isnan(chain_places(positions, np.full(8, np.nan), chains)).all()
@@ -161,7 +164,7 @@ def test_directions_do_not_cross_gaps() -> None:
     x = [1, 0, 0]
     y = [0, 1, 0]
     expected = [x, x, y, y, y, [0, 0, 0]]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert_allclose(found, expected, atol=1e-12)
 
 
 def test_it_is_found_by_name_and_asks_for_a_trace() -> None:

@@ -4,6 +4,7 @@ import gzip
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import load_mesh
@@ -38,7 +39,7 @@ def write(path, values, order=(1, 2, 3), told="start"):
 
 
 def ball(radius=6.0):
-    return radius - np.linalg.norm(points() - CENTRE, axis=-1)
+    return radius - norm(points() - CENTRE, axis=-1)
 
 
 @pytest.mark.parametrize("told", ["start", "origin"])
@@ -46,7 +47,7 @@ def ball(radius=6.0):
 def test_a_ball_lies_where_the_header_says_whatever_the_order_of_axes(order, told, tmp_path):
     path = write(tmp_path / "ball.mrc", ball(), order, told)
     mesh = load_mesh(path, LoadOptions(threshold=0.5))
-    away = np.linalg.norm(mesh.vertices - CENTRE, axis=1)
+    away = norm(mesh.vertices - CENTRE, axis=1)
     np.testing.assert_allclose(away, 5.5, atol=0.05)
     expected = pytest.approx(4 / 3 * np.pi * 5.5**3, rel=0.01)
     assert mesh.volume == expected
@@ -82,7 +83,7 @@ def test_a_box_at_the_border_is_closed_there(tmp_path):
 
 
 def test_dust_is_left_out_and_hollows_are_filled_with_notes(tmp_path):
-    values = np.minimum(ball(), np.linalg.norm(points() - CENTRE, axis=-1) - 2.0)
+    values = np.minimum(ball(), norm(points() - CENTRE, axis=-1) - 2.0)
     values[2, 2, 2] = values[37, 3, 3] = 1.0
     mesh = load_mesh(write(tmp_path / "shell.mrc", values), LoadOptions(threshold=0.0))
     expected = pytest.approx(4 / 3 * np.pi * 6**3, rel=0.01)

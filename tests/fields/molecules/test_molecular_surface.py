@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from scipy.spatial import cKDTree
 from tests.fields.molecules.balls_in_contact import (
     ball,
@@ -16,13 +17,13 @@ from igps.mesh.errors import MeshError
 
 PROBE = 1.4
 # A direction along no axis of the grid.
-ASLANT = np.array([2.0, -1.0, 1.5]) / np.linalg.norm([2.0, -1.0, 1.5])
+ASLANT = np.array([2.0, -1.0, 1.5]) / norm([2.0, -1.0, 1.5])
 
 
 def chain(n, seed=0):
     """A random walk of steps of 1.5 Å."""
     steps = np.random.default_rng(seed).normal(size=(n, 3))
-    return np.cumsum(1.5 * steps / np.linalg.norm(steps, axis=1, keepdims=True), axis=0)
+    return np.cumsum(1.5 * steps / norm(steps, axis=1, keepdims=True), axis=0)
 
 
 @pytest.mark.parametrize(
@@ -33,7 +34,7 @@ def test_a_ball_has_its_area_and_volume(kind, added, radius):
     mesh = molecular_surface(molecule([0.1, 0.2, 0.3], radius), kind, spacing=0.5)
     expected = pytest.approx(ball(radius + added), rel=0.01)
     assert (mesh.area, mesh.volume) == expected
-    away = np.linalg.norm(mesh.vertices - [0.1, 0.2, 0.3], axis=1)
+    away = norm(mesh.vertices - [0.1, 0.2, 0.3], axis=1)
     np.testing.assert_allclose(away, radius + added, rtol=0.02)
     assert mesh.unit == "Å"
 
@@ -103,7 +104,7 @@ def test_a_ring_of_balls_has_a_hole():
 def _ring(n, apart):
     angle = 2 * np.pi * np.arange(n) / n
     across = np.cross(ASLANT, [0, 0, 1.0])
-    across /= np.linalg.norm(across)
+    across /= norm(across)
     other = np.cross(ASLANT, across)
     radius = apart / (2 * np.sin(np.pi / n))
     return radius * (np.outer(np.cos(angle), across) + np.outer(np.sin(angle), other))
@@ -170,7 +171,7 @@ def test_a_simplified_surface_has_the_area_of_the_fine_one():
     assert coarse.area == fine.area
     triangles = coarse.vertices[coarse.faces]
     sides = triangles[:, 1:] - triangles[:, :1]
-    own = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
+    own = norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
     assert abs(own / fine.area - 1) > 0.01
 
 
@@ -178,11 +179,11 @@ def test_the_accessible_area_is_that_of_points_which_no_other_ball_covers():
     at = chain(40, seed=1)
     found = molecular_surface(molecule(at, np.full(40, 1.7)), "accessible").area
     directions = np.random.default_rng(0).normal(size=(4000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions /= norm(directions, axis=1, keepdims=True)
     n_free = 0
     for i, centre in enumerate(at):
         away = centre + 3.1 * directions[:, None] - np.delete(at, i, axis=0)
-        distance = np.linalg.norm(away, axis=2)
+        distance = norm(away, axis=2)
         n_free += int((distance > 3.1).all(axis=1).sum())
     expected = pytest.approx(4 * np.pi * 3.1**2 * n_free / 4000, rel=0.01)
     assert found == expected

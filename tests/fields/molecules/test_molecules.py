@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
 
 from commands import run
 from igps.fields.molecules.bodies import molecule_of
@@ -78,12 +80,12 @@ def test_atoms_have_the_radii_of_their_elements(tmp_path):
     # Bondi 1964
     found = molecule.radii[:5]
     expected = [1.55, 1.70, 1.70, 1.52, 1.70]
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(found, expected, atol=1e-6)
     assert molecule.radii[-1] == pytest.approx(1.80)
     assert molecule.residue_names == ("ALA", "MET")
     assert molecule.residue_of.tolist() == [0] * 5 + [1] * 8
     expected = [[1.46, 0, 3.8], [1.46, 0, 7.6]]
-    np.testing.assert_allclose(molecule.residue_positions, expected)
+    assert_allclose(molecule.residue_positions, expected)
     assert molecule.notes == ()
 
 
@@ -103,9 +105,9 @@ def test_pdb_and_mmcif_and_their_gzipped_files_are_one_molecule(tmp_path):
     for path in paths:
         assert is_structure(path)
     for other in others:
-        np.testing.assert_allclose(other.positions, one.positions)
-        np.testing.assert_array_equal(other.radii, one.radii)
-        np.testing.assert_array_equal(other.charges, one.charges)
+        assert_allclose(other.positions, one.positions)
+        assert_array_equal(other.radii, one.radii)
+        assert_array_equal(other.charges, one.charges)
         assert other.residue_names == one.residue_names
 
 
@@ -136,9 +138,9 @@ def test_a_pqr_file_has_its_own_charges_and_radii(tmp_path):
     molecules = read_molecule(written(tmp_path, rows, "made.pqr"), "models")
     (molecule,) = molecules
     expected = [-0.3, 0.3, 0.1]
-    np.testing.assert_allclose(molecule.charges, expected, rtol=1e-6)
+    assert_allclose(molecule.charges, expected, rtol=1e-6)
     expected = [1.85, 0, 2]
-    np.testing.assert_allclose(molecule.radii, expected, atol=1e-6)
+    assert_allclose(molecule.radii, expected, atol=1e-6)
     assert molecule.residue_names == ("ALA", "HIS")
     assert np.isnan(molecule.b_factors).all()
     assert molecule.notes == ("radii and charges are those of the PQR file",)
@@ -169,7 +171,7 @@ def test_charges_are_those_of_residues_at_ph_7(tmp_path):
     (molecule,) = read_molecule(written(tmp_path, text))
     sums = np.bincount(molecule.residue_of, molecule.charges)
     expected = [-1, -1, 1, 1, 0.1, 0, -0.5]
-    np.testing.assert_allclose(sums, expected)
+    assert_allclose(sums, expected)
 
 
 def test_models_and_chains_are_bodies_of_their_own(tmp_path):
@@ -199,7 +201,7 @@ def test_an_assembly_is_built_by_its_operators(tmp_path):
     one = molecule.positions[:5]
     found = molecule.positions[5:]
     expected = one * [-1, -1, 1] + [0, 0, 50]
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert_allclose(found, expected, atol=1e-4)
     (alone,) = read_molecule(written(tmp_path, residue(1)), "assembly")
     assert alone.notes == ("the file defines no assembly: the model was used",)
 
@@ -277,10 +279,10 @@ def test_a_backbone_gets_balls_of_its_side_chains(tmp_path):
     assert found == pytest.approx(volume)
     # It touches Cα, on the side of Cβ, which tetrahedral geometry has away from N and C.
     away = leucine[0] - [1.46, 0, 3.8]
-    assert np.linalg.norm(away) == pytest.approx(leucine[1])
+    assert norm(away) == pytest.approx(leucine[1])
     for bonded in ([0.0, 0.0, 3.8], [2.0, 1.4, 3.8]):
         bond = np.array(bonded) - [1.46, 0, 3.8]
-        cosine = away @ bond / np.linalg.norm(away) / np.linalg.norm(bond)
+        cosine = away @ bond / norm(away) / norm(bond)
         found = np.degrees(np.arccos(cosine))
         expected = pytest.approx(109.5, abs=4)
         assert found == expected
@@ -311,8 +313,8 @@ def test_a_cut_side_chain_gets_what_it_lacks_at_its_last_atom(n_present, tmp_pat
     assert found == expected
     alpha = np.array([1.46, 0, 3.8])
     last = np.array([2.0 + 0.6 * (n_present - 1), -0.8 - 1.2 * (n_present - 1), 3.8])
-    out = (last - alpha) / np.linalg.norm(last - alpha)
-    np.testing.assert_allclose(ball, last + radius * out, atol=1e-9)
+    out = (last - alpha) / norm(last - alpha)
+    assert_allclose(ball, last + radius * out, atol=1e-9)
 
 
 def test_names_tell_the_state_of_protonation(tmp_path):
@@ -323,7 +325,7 @@ def test_names_tell_the_state_of_protonation(tmp_path):
         (molecule,) = read_molecule(written(tmp_path, text))
         sums = np.bincount(molecule.residue_of, molecule.charges)
         expected = list(charges.values())
-        np.testing.assert_allclose(sums, expected, atol=1e-12)
+        assert_allclose(sums, expected, atol=1e-12)
 
 
 def test_an_atom_that_is_given_twice_counts_once(tmp_path):
@@ -331,7 +333,7 @@ def test_an_atom_that_is_given_twice_counts_once(tmp_path):
     twice = [*LYSINE, *LYSINE[-3:]]
     (once,) = read_molecule(written(tmp_path, residue(1, "LYS", LYSINE)))
     (molecule,) = read_molecule(written(tmp_path, residue(1, "LYS", twice)))
-    np.testing.assert_array_equal(molecule.positions, once.positions)
+    assert_array_equal(molecule.positions, once.positions)
     assert molecule.charges.sum() == 1
 
 
@@ -340,7 +342,7 @@ def test_a_trace_has_balls_of_its_residues(tmp_path):
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.notes == ("8 residues of Cα alone: a ball of the residue's volume was used",)
     found = 4 / 3 * np.pi * molecule.radii**3
-    np.testing.assert_allclose(found, VOLUMES["ASP"])
+    assert_allclose(found, VOLUMES["ASP"])
     assert molecule.charges.tolist() == [-1.0] * 8
     assert molecular_surface(molecule).volume > 6 * VOLUMES["ASP"]
 
@@ -371,7 +373,7 @@ def test_unknown_elements_and_residues_are_kept_with_a_note(tmp_path):
     (molecule,) = read_molecule(written(tmp_path, residue(1, "QQQ") + odd))
     found = molecule.radii[5:]
     expected = [1.55, 1.70, 1.70, 1.52, 1.70, 1.70]
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(found, expected, atol=1e-6)
     assert molecule.residue_names == ("QQQ", "ALA")
     assert molecule.notes == (
         "5 atoms without an element: it was inferred from their names",
@@ -491,7 +493,7 @@ def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path):
     (molecule,) = read_molecule(written(tmp_path, text))
     # Bondi 1964
     expected = [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.7, 1.52, 1.55]
-    np.testing.assert_allclose(molecule.radii, expected, atol=1e-6)
+    assert_allclose(molecule.radii, expected, atol=1e-6)
     # And calcium, which some write as an atom of the polymer, is no residue.
     ion = Atom(9, "CA", 5.0, 5.0, 5.0, residue="CA", place="  99 ", element="CA").line()
     (molecule,) = read_molecule(written(tmp_path, residue(1) + ion))
@@ -505,7 +507,7 @@ def test_no_line_is_lost_to_marks_of_text_or_to_frames(tmp_path):
     path = tmp_path / "other.pdb"
     for other in (f"\ufeff{text}", text.replace("\n", "\r"), text.replace("\n", "\r\n")):
         path.write_bytes(other.encode())
-        np.testing.assert_array_equal(read_molecule(path)[0].positions, usual.positions)
+        assert_array_equal(read_molecule(path)[0].positions, usual.positions)
     frames = f"CRYST1\n{text}END\n{residue(1)}END\n"
     found = read_molecule(written(tmp_path, frames), "models")
     assert [len(molecule.radii) for molecule in found] == [10, 5]
@@ -556,7 +558,7 @@ def test_coordinates_of_nine_characters_are_read(tmp_path):
     text = "".join(line[:30] + wide + line[54:] for line in lines)
     (molecule,) = read_molecule(written(tmp_path, text))
     expected = [[-1234.57, -2000.25, 12345.68]] * 3
-    np.testing.assert_allclose(molecule.residue_positions, expected, atol=1e-9)
+    assert_allclose(molecule.residue_positions, expected, atol=1e-9)
     assert molecule.b_factors.tolist() == [20.0] * 3
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 
 from igps.fields.molecules import residue_attributes as module
 from igps.fields.molecules.molecule import Molecule
@@ -66,22 +67,22 @@ def test_an_attribute_is_a_gaussian_mean_over_residues(name, of_residue):
     molecule = peptide(*names)
     found = residue_attribute(molecule, points(), name)
     wanted = means_written_out(molecule, [of_residue(one) for one in names])
-    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
 
 
 def test_b_factors_are_the_molecules_own():
     molecule = peptide("ALA", "GLY", "SER")
     wanted = means_written_out(molecule, [0.0, 1.0, 2.0])
     found = residue_attribute(molecule, points(), "b_factor")
-    np.testing.assert_allclose(found, wanted, rtol=1e-9)
+    assert_allclose(found, wanted, rtol=1e-9)
 
 
 def test_shares_of_kinds_sum_to_one_and_follow_the_names():
     molecule = peptide("ALA", "DT", "U", "ZN", "DG")
     shares = residue_attribute(molecule, points(), "residue_shares")
-    np.testing.assert_allclose(shares.sum(axis=1), 1)
+    assert_allclose(shares.sum(axis=1), 1)
     weight = means_written_out(molecule, [0, 1, 1, 0, 0])
-    np.testing.assert_allclose(shares[:, RESIDUE_KINDS.index("U")], weight)
+    assert_allclose(shares[:, RESIDUE_KINDS.index("U")], weight)
     used = {RESIDUE_KINDS[i] for i in np.flatnonzero(shares.max(axis=0))}
     assert used == {"ALA", "U", "G", "other"}
 
@@ -93,7 +94,7 @@ def test_what_is_not_known_does_not_count_and_is_never_made_up():
     )
     found = residue_attribute(molecule, points(), "hydropathy")
     expected = residue_attribute(known, points(), "hydropathy")
-    np.testing.assert_allclose(found, expected)
+    assert_allclose(found, expected)
     assert np.isnan(residue_attribute(peptide("QQQ", "ZN"), points(), "hydropathy")).all()
 
 
@@ -103,7 +104,7 @@ def test_far_outside_the_nearest_residue_counts():
     nearest = np.linalg.norm(far[:, None] - molecule.residue_positions, axis=2).argmin(axis=1)
     found = residue_attribute(molecule, far, "hydropathy")
     expected = [HYDROPATHY[molecule.residue_names[i]] for i in nearest]
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_the_potential_of_one_charge_is_that_of_debye_and_hueckel():
@@ -119,7 +120,7 @@ def test_the_potential_of_one_charge_is_that_of_debye_and_hueckel():
     bjerrum = 1.602176634e-19**2 / thermal * 1e10
     screened = np.exp(-counted * np.sqrt(0.15) / 3.04)
     expected = -2 * bjerrum * screened / counted
-    np.testing.assert_allclose(found, expected, rtol=5e-3)
+    assert_allclose(found, expected, rtol=5e-3)
 
 
 def test_potentials_add_up():
@@ -127,7 +128,7 @@ def test_potentials_add_up():
     expected = screened_potential(peptide("ASP", "ALA", "ALA"), points())
     expected += screened_potential(peptide("ALA", "ALA", "LYS"), points())
     found = screened_potential(molecule, points())
-    np.testing.assert_allclose(found, expected)
+    assert_allclose(found, expected)
     np.testing.assert_array_equal(screened_potential(peptide("ALA"), points()), 0)
 
 
@@ -137,9 +138,9 @@ def test_many_points_in_blocks_are_as_few_at_once(monkeypatch):
     whole = residue_means(molecule, points(50), values), screened_potential(molecule, points(50))
     monkeypatch.setattr(module, "_BLOCK_SIZE", 12)
     found = residue_means(molecule, points(50), values)
-    np.testing.assert_allclose(found, whole[0])
+    assert_allclose(found, whole[0])
     found = screened_potential(molecule, points(50))
-    np.testing.assert_allclose(found, whole[1])
+    assert_allclose(found, whole[1])
 
 
 def test_each_attribute_is_known_by_its_name():
@@ -164,5 +165,5 @@ def test_a_signature_gets_attributes_and_keeps_its_own():
         charge = residue_attribute(molecule, samples.points, "charge")
         found = samples.with_attributes({"charge": charge}).attributes
         assert set(found) == {"surface_direction", "charge"}
-        np.testing.assert_allclose(found["charge"], charge, rtol=1e-5, atol=1e-6)
+        assert_allclose(found["charge"], charge, rtol=1e-5, atol=1e-6)
     assert set(signature.interior.attributes) == {"surface_direction"}

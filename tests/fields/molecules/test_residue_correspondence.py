@@ -4,6 +4,7 @@ import csv
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from commands import run
@@ -61,16 +62,16 @@ def test_the_turned_part_has_the_paint_in_both_and_structures_are_superposed(
     steps[HINGE:] = np.linalg.norm(Rotation.from_rotvec([0.0, 1.0, 0.0]).apply(arm) - arm, axis=1)
     told = np.array([float(row["displacement"]) for row in rows]).reshape(2, N_RESIDUES)
     expected = np.stack([steps, steps])
-    np.testing.assert_allclose(told, expected, atol=0.02)
+    assert_allclose(told, expected, atol=0.02)
     assert rows[0]["place"] == f"A 1 {SEQUENCE[0]}"
     assert rows[-1]["place"] == f"A 360 {SEQUENCE[-1]}"
     structures = [gemmi.read_structure(str(out / f"explain_{i}.cif"))[0]["A"] for i in (1, 2)]
     shares = np.square(steps) / np.square(steps).sum()
     for chain in structures:
         factors = [residue[0].b_iso for residue in chain]
-        np.testing.assert_allclose(factors, 100 * shares, atol=0.05)
+        assert_allclose(factors, 100 * shares, atol=0.05)
     ends = [np.array([r[0].pos.tolist() for r in chain])[:HINGE] for chain in structures]
-    np.testing.assert_allclose(ends[0], ends[1], atol=0.02)
+    assert_allclose(ends[0], ends[1], atol=0.02)
     with (out / "explain_samples.csv").open() as file:
         samples = [row for row in csv.DictReader(file) if row["samples"] == "surface"]
     first = [row for row in samples if row["name"].endswith("one.pdb#chain A")]

@@ -4,6 +4,7 @@ import csv
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from commands import error_of, run
 from igps.fields.molecules.structures import read_molecule
@@ -57,9 +58,9 @@ def test_each_frame_keeps_places_charges_and_residues(files, tmp_path):
     for path, number, _ in written:
         (molecule,) = read_molecule(path, "models")
         expected = hinges()[number, : 2 * N_ARM]
-        np.testing.assert_allclose(molecule.positions, expected, atol=1e-3)
-        np.testing.assert_allclose(molecule.charges, charges, atol=1e-4)
-        np.testing.assert_allclose(molecule.radii, 1.7)
+        assert_allclose(molecule.positions, expected, atol=1e-3)
+        assert_allclose(molecule.charges, charges, atol=1e-4)
+        assert_allclose(molecule.radii, 1.7)
         assert molecule.residue_labels == ("A 1",)
 
 

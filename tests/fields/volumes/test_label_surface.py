@@ -9,6 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from scipy.special import elliprg
@@ -80,8 +83,8 @@ def ball(r):
 def voxels(body, matrix, rng):
     """The body, turned and moved at random, at the centres of voxels: (X, Y, Z), and the affine (4, 4)."""
     turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
-    size = np.linalg.norm(body.half)
-    reach = np.ceil(np.linalg.norm(np.linalg.inv(matrix), axis=1) * size).astype(int) + 1
+    size = norm(body.half)
+    reach = np.ceil(norm(np.linalg.inv(matrix), axis=1) * size).astype(int) + 1
     index = np.stack(np.meshgrid(*(np.arange(2 * n + 1) for n in reach), indexing="ij"), axis=-1)
     affine = np.eye(4)
     affine[:3, :3] = matrix
@@ -99,14 +102,14 @@ def errors(body, matrix, rng):
     assert mesh.genus == body.genus
     centre = np.mean([vertices.min(axis=0), vertices.max(axis=0)], axis=0)
     expected = (100, -50, 20)
-    np.testing.assert_allclose(centre, expected, atol=np.abs(matrix).max())
+    assert_allclose(centre, expected, atol=np.abs(matrix).max())
     return abs(mesh.volume / body.volume - 1), abs(mesh.area / body.area - 1)
 
 
 @pytest.mark.parametrize("length", [1, 2.5, 6])
 @pytest.mark.parametrize(("n_voxels", "most"), [(9, (0.01, 0.02)), (4, (0.05, 0.08))])
 def test_voxelised_bodies_give_back_volume_and_area(length, n_voxels, most):
-    rng = np.random.default_rng([n_voxels, int(length)])
+    rng = default_rng([n_voxels, int(length)])
     matrix = 0.8 * np.diag(rng.permutation([1, 1, length]))
     radius = 0.4 * n_voxels * length
     solids = [kind(radius) for kind in (ellipsoid, torus, capsule, rod, plate)]
@@ -124,7 +127,7 @@ def test_voxelised_bodies_give_back_volume_and_area(length, n_voxels, most):
     ids=["left-handed", "axes turned", "sheared"],
 )
 def test_the_affine_is_honoured(matrix):
-    volume, area = errors(ball(14), matrix, np.random.default_rng(1))
+    volume, area = errors(ball(14), matrix, default_rng(1))
     assert volume < 0.01
     assert area < 0.02
 
@@ -132,22 +135,22 @@ def test_the_affine_is_honoured(matrix):
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_the_unit_of_length_changes_nothing(unit):
     """Voxels of a nanometre and of a mouse's micro-CT in millimetres, and of a kilometre."""
-    mask = voxels(torus(4.5), np.eye(3), np.random.default_rng(5))[0]
+    mask = voxels(torus(4.5), np.eye(3), default_rng(5))[0]
     vertices, faces, _ = voxel_surface(mask, np.diag([1, 1, 2, 1]))
     found, triangles, _ = voxel_surface(mask, unit * np.diag([1, 1, 2, 1 / unit]))
     np.testing.assert_array_equal(triangles, faces)
-    np.testing.assert_allclose(found / unit, vertices, atol=1e-6)
+    assert_allclose(found / unit, vertices, atol=1e-6)
 
 
 def test_many_voxels_are_put_on_a_coarser_grid_and_nothing_is_lost_by_it():
-    mask, affine = voxels(ball(60), np.eye(3), np.random.default_rng(2))
+    mask, affine = voxels(ball(60), np.eye(3), default_rng(2))
     vertices, faces, _ = voxel_surface(mask, affine, max_vertices=2000)
     mesh = Mesh(vertices, faces)
     assert len(mesh.vertices) <= 2000
     assert mesh.volume == pytest.approx(np.count_nonzero(mask), rel=1e-6)
     expected = pytest.approx(4 * np.pi * 60**2, rel=0.01)
     assert mesh.area == expected
-    radius = np.linalg.norm(mesh.vertices - (100, -50, 20), axis=1)
+    radius = norm(mesh.vertices - (100, -50, 20), axis=1)
     assert abs(radius - 60).max() < 0.5
 
 
@@ -178,19 +181,19 @@ def test_a_thin_ring_in_a_large_box_needs_little_memory_and_has_no_seams():
 
 def test_a_ball_has_no_stairs():
     """Voxels leave the radius free within about half a side; steps of a mask scatter it by 0.29, 1 / √12."""
-    random = np.random.default_rng(4)
+    random = default_rng(4)
     scatter = []
     for _ in range(6):
         mask, affine = voxels(ball(10), np.eye(3), random)
         vertices, _, _ = voxel_surface(mask, affine)
-        scatter.append(np.linalg.norm(vertices - (100, -50, 20), axis=1).std())
+        scatter.append(norm(vertices - (100, -50, 20), axis=1).std())
     assert np.mean(scatter) < 0.06
 
 
 def test_every_voxel_stays_on_its_side():
     import igl
 
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     mask, affine = voxels(torus(2.5), np.diag([1, 1, 2.0]), rng)
     vertices, faces, _ = voxel_surface(mask, affine)
     centres = np.argwhere(np.ones_like(mask)) @ affine[:3, :3].T + affine[:3, 3]
@@ -200,10 +203,10 @@ def test_every_voxel_stays_on_its_side():
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (1, 1, 1), (3, 2, 1)])
 def test_a_rib_of_two_voxels_stays_one_body(direction):
-    axis = np.array(direction) / np.linalg.norm(direction)
+    axis = np.array(direction) / norm(direction)
     points = np.stack(np.meshgrid(*3 * [np.arange(40.0)], indexing="ij"), axis=-1) - 19.6
     along = points @ axis
-    mask = (np.linalg.norm(points - along[..., None] * axis, axis=-1) < 1) & (abs(along) < 16)
+    mask = (norm(points - along[..., None] * axis, axis=-1) < 1) & (abs(along) < 16)
     mesh = Mesh(*voxel_surface(mask)[:2])
     assert mesh.genus == 0
     assert mesh.volume == pytest.approx(np.count_nonzero(mask), rel=0.05)
@@ -230,10 +233,10 @@ def test_neighbours_that_touch_meet_in_the_middle_between_their_voxels():
     labels[12:21, 3:17, 3:17] = 2
     one, two = (Mesh(*voxel_surface(labels == label)[:2]) for label in (1, 2))
     for mesh in (one, two):
-        near = np.linalg.norm(mesh.vertices[:, 1:] - 9.5, axis=1) < 5
+        near = norm(mesh.vertices[:, 1:] - 9.5, axis=1) < 5
         at = mesh.vertices[near & (abs(mesh.vertices[:, 0] - 11.5) < 2), 0]
         assert len(at)
-        np.testing.assert_allclose(at, 11.5, atol=0.15)
+        assert_allclose(at, 11.5, atol=0.15)
 
 
 def test_small_pieces_apart_are_dropped_and_large_ones_stay():
@@ -270,7 +273,7 @@ def rod_across(angle, radius=6.0, length=30.0, n=52):
     axis = np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
     points = np.moveaxis(np.indices((n, n, n)), 0, -1) - (n - 1) / 2
     along = np.clip(points @ axis, -length / 2, length / 2)
-    return np.asarray(np.linalg.norm(points - along[..., None] * axis, axis=-1) < radius)
+    return np.asarray(norm(points - along[..., None] * axis, axis=-1) < radius)
 
 
 @pytest.mark.parametrize(
@@ -307,7 +310,7 @@ def test_a_bar_is_as_thick_on_every_grid(side):
     """Two balls of radius 15 at a distance of 10: a fiftieth of the square root of their area is 1.5."""
     n = np.ceil(np.array([37, 16, 16]) / side).astype(int)
     points = (np.moveaxis(np.indices(2 * n + 1), 0, -1) - n) * side
-    mask = np.linalg.norm(points - [20, 0, 0], axis=-1) < 15
+    mask = norm(points - [20, 0, 0], axis=-1) < 15
     mask |= mask[::-1]
     affine = np.diag([side, side, side, 1])
     affine[:3, 3] = -n * side

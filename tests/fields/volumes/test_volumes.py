@@ -9,6 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 from igps.fields.volumes.label_names import read_label_names
 from igps.fields.volumes.label_volume import (
@@ -43,7 +46,7 @@ def two_boxes():
 def itk_image(labels, affine=AFFINE, vector=False):
     image = sitk.GetImageFromArray(np.ascontiguousarray(np.swapaxes(labels, 0, 2)), isVector=vector)
     lps = np.diag([-1, -1, 1, 1]) @ affine
-    spacing = np.linalg.norm(lps[:3, :3], axis=0)
+    spacing = norm(lps[:3, :3], axis=0)
     image.SetSpacing(spacing.tolist())
     image.SetDirection((lps[:3, :3] / spacing).ravel().tolist())
     image.SetOrigin(lps[:3, 3].tolist())
@@ -76,7 +79,7 @@ def write_segmentation(path, masks, names, *kind):
     from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 
     lps = np.diag([-1, -1, 1, 1]) @ AFFINE
-    spacing = np.linalg.norm(lps[:3, :3], axis=0)
+    spacing = norm(lps[:3, :3], axis=0)
     planes = []
     study = generate_uid()
     series = generate_uid()
@@ -153,12 +156,12 @@ def test_every_format_gives_the_same_bodies_in_the_world(name, tmp_path):
         mesh = label_surface(volume, label)
         expected = label_surface(given, at)
         found = sorted(mesh.vertices[:, 0])
-        np.testing.assert_allclose(found, sorted(expected.vertices[:, 0]), atol=1e-3)
+        assert_allclose(found, sorted(expected.vertices[:, 0]), atol=1e-3)
         expected = pytest.approx(n_voxels * 1 * 1.5 * 2.5, rel=1e-3)
         assert mesh.volume == expected
         centre = AFFINE[:3, :3] @ np.argwhere(two_boxes() == at).mean(axis=0) + AFFINE[:3, 3]
         found = mesh.vertices.mean(axis=0)
-        np.testing.assert_allclose(found, centre, atol=0.4)
+        assert_allclose(found, centre, atol=0.4)
 
 
 def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path):
@@ -169,9 +172,9 @@ def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path):
     volume = read_label_volume(tmp_path / "x.tif")
     found = np.diag(volume.affine)
     expected = [0.5e-3, 0.25e-3, 2e-3, 1]
-    np.testing.assert_allclose(found, expected)
+    assert_allclose(found, expected)
     assert volume.unit == "mm"
-    np.testing.assert_array_equal(volume.layers[0], two_boxes())
+    assert_array_equal(volume.layers[0], two_boxes())
     tifffile.imwrite(tmp_path / "y.tiff", stack, photometric="minisblack")
     plain = read_label_volume(tmp_path / "y.tiff")
     assert plain.unit is None
@@ -194,9 +197,9 @@ def test_imagej_escapes_units_and_leaves_a_spacing_of_one_out(words, sides, unit
     tifffile.imwrite(tmp_path / "x.tif", stack, resolution=(2, 4), **how)
     volume = read_label_volume(tmp_path / "x.tif")
     found = np.diag(volume.affine)[:3]
-    np.testing.assert_allclose(found, sides)
+    assert_allclose(found, sides)
     assert volume.unit == unit
-    np.testing.assert_array_equal(volume.layers[0], two_boxes())
+    assert_array_equal(volume.layers[0], two_boxes())
 
 
 def test_pages_that_were_written_one_by_one_are_a_stack(tmp_path):
@@ -204,14 +207,14 @@ def test_pages_that_were_written_one_by_one_are_a_stack(tmp_path):
         for page in np.ascontiguousarray(two_boxes().T):
             file.write(page, photometric="minisblack")
     found = read_label_volume(tmp_path / "x.tif").layers[0]
-    np.testing.assert_array_equal(found, two_boxes())
+    assert_array_equal(found, two_boxes())
 
 
 def test_a_stack_compressed_by_lzw_is_read(tmp_path):
     image = sitk.GetImageFromArray(np.ascontiguousarray(two_boxes().T))
     sitk.WriteImage(image, str(tmp_path / "x.tif"), useCompression=True, compressor="LZW")
     found = read_label_volume(tmp_path / "x.tif").layers[0]
-    np.testing.assert_array_equal(found, two_boxes())
+    assert_array_equal(found, two_boxes())
 
 
 def write_nrrd(path, *lines):
@@ -261,7 +264,7 @@ def test_lengths_of_nifti_are_in_its_unit(kind, unit, side):
     """Pairs of a header and its voxels, too, which nibabel reads."""
     image = getattr(nibabel, kind)(two_boxes(), np.diag([side, side, side, 1.0]) @ AFFINE)
     image.header.set_xyzt_units(unit)
-    np.testing.assert_allclose(volume_in_memory(image).affine, AFFINE, rtol=1e-6)
+    assert_allclose(volume_in_memory(image).affine, AFFINE, rtol=1e-6)
 
 
 @pytest.mark.parametrize("order", ["RAS", "PIL"])
@@ -270,8 +273,8 @@ def test_the_order_of_the_axes_in_a_file_is_no_matter(order, suffix, tmp_path):
     sitk.WriteImage(sitk.DICOMOrient(itk_image(two_boxes()), order), str(tmp_path / f"x.{suffix}"))
     expected = label_surface(LabelVolume((two_boxes(),), AFFINE), 3)
     found = load_mesh(tmp_path / f"x.{suffix}", part="3")
-    np.testing.assert_allclose(found.vertices, expected.vertices, atol=1e-5)
-    np.testing.assert_array_equal(found.faces, expected.faces)
+    assert_allclose(found.vertices, expected.vertices, atol=1e-5)
+    assert_array_equal(found.faces, expected.faces)
 
 
 @pytest.mark.parametrize(
@@ -303,14 +306,14 @@ def test_a_list_of_layers_in_a_nrrd_file_may_be_any_axis(space, axes, last, tmp_
     volume = read_label_volume(tmp_path / "x.seg.nrrd")
     expected = [(3, "liver", 384), (7, "spleen", 320)]
     assert label_bodies(volume) == expected
-    np.testing.assert_allclose(volume.affine, AFFINE, atol=1e-9)
+    assert_allclose(volume.affine, AFFINE, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["x.mha", "x.nrrd", "x.nii.gz", "x.mgz"])
 def test_suffixes_may_be_upper_case(name, tmp_path):
     WRITERS.get(name, write_itk)(tmp_path / name, two_boxes())
     path = (tmp_path / name).rename(tmp_path / name.upper())
-    np.testing.assert_array_equal(read_label_volume(path).layers[0], two_boxes())
+    assert_array_equal(read_label_volume(path).layers[0], two_boxes())
 
 
 @pytest.mark.parametrize("name", ["x.raw", "./x.raw"])
@@ -390,8 +393,8 @@ def test_fractional_segments_of_dicom_are_cut_at_the_threshold(most, tmp_path):
     soft = (((9, 9, 6), 5), ((14, 10, 9), 4))
     shares = []
     for centre, radius in soft:
-        shares.append(np.clip(1.5 - np.linalg.norm(place - centre, axis=-1) / radius, 0, 1))
-    shares.append(np.linalg.norm(place - (8, 9, 8), axis=-1) < 4)
+        shares.append(np.clip(1.5 - norm(place - centre, axis=-1) / radius, 0, 1))
+    shares.append(norm(place - (8, 9, 8), axis=-1) < 4)
     names = ["liver", "tumour  (left)", "vessel"]
     path = tmp_path / "x.dcm"
     masks = np.stack(shares, axis=-1).astype(np.float32)
@@ -433,7 +436,7 @@ def test_fractional_segments_of_dicom_are_cut_at_the_threshold(most, tmp_path):
             sets = [
                 np.unique(np.round(one, 2), axis=0) for one in (points, np.concatenate(expected))
             ]
-            np.testing.assert_allclose(*sets, atol=0.02)
+            assert_allclose(*sets, atol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -556,7 +559,7 @@ def test_labels_that_were_given_as_numbers_with_a_fraction_are_whole_again(tmp_p
 
 
 def test_probabilities_are_cut_at_the_threshold(tmp_path):
-    ball = np.linalg.norm(np.indices((20, 20, 20)) - 9.5, axis=0)
+    ball = norm(np.indices((20, 20, 20)) - 9.5, axis=0)
     shares = np.clip(1.5 - ball / 8, 0, 1).astype(np.float32)
     nibabel.save(nibabel.Nifti1Image(shares, np.eye(4)), tmp_path / "x.nii")
     radius = {}
@@ -597,7 +600,7 @@ def test_an_array_without_voxels_is_refused_in_a_sentence(dtype):
 
 def test_probabilities_may_overshoot(tmp_path):
     """SPM keeps them as bytes times 1/255 in single precision, so that the largest is more than 1."""
-    ball = np.linalg.norm(np.indices((20, 20, 20)) - 9.5, axis=0)
+    ball = norm(np.indices((20, 20, 20)) - 9.5, axis=0)
     share = np.clip(1.5 - ball / 8, 0, 1)
     image = nibabel.Nifti1Image(np.round(share * 255).astype(np.uint8), np.eye(4))
     header = bytearray(image.header.binaryblock)
@@ -629,7 +632,7 @@ def nifti(path, values, affine=AFFINE):
 
 
 def cut_short(path):
-    nifti(path, np.random.default_rng(0).integers(0, 3, (40, 40, 40)).astype(np.uint8))
+    nifti(path, default_rng(0).integers(0, 3, (40, 40, 40)).astype(np.uint8))
     path.write_bytes(path.read_bytes()[:3000])
 
 
@@ -655,7 +658,7 @@ def singular(path):
 def unusable_values():
     """Arrays that are no labels, by what they are."""
     labels = two_boxes()
-    scan = np.random.default_rng(0).normal(120, 15, (40, 40, 40))
+    scan = default_rng(0).normal(120, 15, (40, 40, 40))
     scan[:20] = 24  # a background that is not 0
     return {
         "4D": np.stack([labels, labels], axis=-1),
@@ -846,7 +849,7 @@ def test_a_table_that_names_nothing_is_refused(tmp_path):
 
 def test_thin_branches_are_not_taken_for_noise():
     """A tree of vessels two voxels wide, whose corners are as rough as a scanner's noise, has the voxels' volume."""
-    random = np.random.default_rng(3)
+    random = default_rng(3)
     mask = np.zeros((96, 96, 96), dtype=np.uint8)
     ends = [np.array([48.0, 48.0, 4.0])]
     for _ in range(60):

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from torch import nn
 
 from batches import batch_of, embedded, two_bodies
@@ -34,13 +35,13 @@ def test_hats_are_the_linear_kernel():
     centres = [0.1, 0.35, 0.4, 0.95]
     expected = [hat(float(value), centres) for value in values]
     result = soft_memberships(values, torch.tensor(centres, dtype=torch.float64))
-    np.testing.assert_allclose(result, expected, atol=1e-14)
+    assert_allclose(result, expected, atol=1e-14)
     assert torch.equal(
         soft_memberships(values, torch.tensor([0.4])), torch.ones(8, 1, dtype=torch.float64)
     )
     in_rows = soft_memberships(values.view(2, 4), torch.tensor(centres, dtype=torch.float64))
     found = in_rows.flatten(0, 1)
-    np.testing.assert_allclose(found, expected, atol=1e-14)
+    assert_allclose(found, expected, atol=1e-14)
 
 
 def test_hats_are_differentiable_in_both_arguments():
@@ -78,7 +79,7 @@ def test_members_are_memberships_without_their_zeros(options, depths):
 def test_soft_classes_are_hats(learnable):
     axis = Potential(3, 0.9, soft=True, learnable=learnable)
     values = torch.linspace(0, 1.2, 30)
-    np.testing.assert_allclose(
+    assert_allclose(
         axis.memberships(values).detach(), soft_classes(values, [0.15, 0.45, 0.75]), atol=1e-6
     )
     assert len(list(axis.parameters())) == learnable
@@ -104,7 +105,7 @@ def test_values_of_points():
     seen = view()
     potential = Potential().values(seen, SpectralEmbedding(n_eigenpairs=4))
     for i, n in enumerate((40, 25)):
-        np.testing.assert_allclose(
+        assert_allclose(
             potential[i, :n], embedded(two_bodies(), i, n_eigenpairs=4).norm(dim=1), rtol=1e-5
         )
     assert torch.equal(
@@ -164,9 +165,7 @@ def test_named_axes_are_made_as_they_are_by_default():
     found = {name: type(axis_of(name)) for name in AXES}
     assert found == dict(AXES)
     assert isinstance(axis_of("interior_distance"), PairAxis)
-    np.testing.assert_allclose(
-        axis_of("potential").centres(), np.arange(4) * 0.375 + 0.1875, rtol=1e-6
-    )
+    assert_allclose(axis_of("potential").centres(), np.arange(4) * 0.375 + 0.1875, rtol=1e-6)
 
 
 def test_a_wrong_name_lists_the_axes():

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from sklearn.metrics import log_loss
+from torch.testing import assert_close
 
 from igps.nn.heads import ClassifierHead, KernelHead, WhitenedHead
 from igps.nn.heads.classifier import folds
@@ -39,15 +40,13 @@ def test_scores_are_those_of_the_kernel_head_and_probabilities_their_softmax():
     new, _ = drawn(4, 5, seed=1)
     found = head.scores(new)
     expected = kernel.scores(new)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
-    torch.testing.assert_close(head(new), kernel(new), rtol=0, atol=1e-6)
+    assert_close(found, expected, rtol=0, atol=1e-6)
+    assert_close(head(new), kernel(new), rtol=0, atol=1e-6)
     probabilities = head.probabilities(new)
     found = probabilities.sum(dim=1)
     expected = torch.ones(20)
-    torch.testing.assert_close(found, expected)
-    torch.testing.assert_close(
-        probabilities, (kernel.scores(new) / head.calibration).softmax(dim=1)
-    )
+    assert_close(found, expected)
+    assert_close(probabilities, (kernel.scores(new) / head.calibration).softmax(dim=1))
 
 
 def test_the_temperature_is_the_likeliest_on_what_is_held_out():

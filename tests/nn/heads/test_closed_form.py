@@ -5,9 +5,11 @@ from statistics import fmean, pvariance
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.special import softmax
 from sklearn.kernel_ridge import KernelRidge
 from torch.nn.functional import normalize
+from torch.testing import assert_close
 
 from igps.nn.heads.base import Head
 from igps.nn.heads.classifier import ClassifierHead
@@ -49,17 +51,15 @@ def test_whitening_is_the_inverse_root_of_the_covariance(collection):
     values, vectors = np.linalg.eigh(within + 0.5 * np.eye(N_CELLS))
     expected = (roots - roots.mean(axis=0)) @ vectors / np.sqrt(values) @ vectors.T
     head = WhitenedHead(n_directions=40, shrinkage=0.5).fit(histograms, labels)
-    np.testing.assert_allclose(head(histograms), normalize(torch.from_numpy(expected)), atol=2e-5)
+    assert_allclose(head(histograms), normalize(torch.from_numpy(expected)), atol=2e-5)
 
 
 def test_few_directions_are_the_largest(collection):
     histograms, labels = collection
     few = WhitenedHead(n_directions=3).fit(histograms, labels)
     many = WhitenedHead(n_directions=40).fit(histograms, labels)
-    torch.testing.assert_close(few.gains, many.gains[:, :3])
-    torch.testing.assert_close(
-        (few.directions @ many.directions[:3].T).abs(), torch.eye(3), atol=1e-4, rtol=0
-    )
+    assert_close(few.gains, many.gains[:, :3])
+    assert_close((few.directions @ many.directions[:3].T).abs(), torch.eye(3), atol=1e-4, rtol=0)
 
 
 def test_parts_are_whitened_one_by_one(collection):
@@ -69,32 +69,32 @@ def test_parts_are_whitened_one_by_one(collection):
     separate = [WhitenedHead().fit(part, labels)(part) for part in parts]
     expected = torch.stack([cosine(one, one) for one in separate]).mean(dim=0)
     found = cosine(together, together)
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+    assert_close(found, expected, atol=1e-5, rtol=0)
 
 
 def test_an_unfitted_head_gives_normalised_square_roots(collection):
     """Whatever the number of cells."""
     found = WhitenedHead()(collection[0])
     expected = collection[0].sqrt()
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     few = collection[0][:, :7]
     found = WhitenedHead()(few)
     expected = normalize(few.sqrt())
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     stacked = collection[0].view(48, 4, 15)
     found = WhitenedHead()(stacked)
     expected = collection[0].sqrt()
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
 
 
 def test_centred_head_damps_nothing(collection):
     histograms, _ = collection
     roots = histograms.sqrt() - histograms.sqrt().mean(dim=0)
     found = WhitenedHead().centre(histograms)(histograms)
-    torch.testing.assert_close(found, normalize(roots))
+    assert_close(found, normalize(roots))
     parts = [normalize(part) / 2**0.5 for part in roots.split([20, 40], dim=1)]
     in_parts = WhitenedHead().centre(histograms, (20, 40))(histograms)
-    torch.testing.assert_close(in_parts, torch.cat(parts, dim=1))
+    assert_close(in_parts, torch.cat(parts, dim=1))
 
 
 def test_whitening_serves_classes_it_was_not_fitted_to(collection):
@@ -110,7 +110,7 @@ def test_order_of_the_training_shapes_does_not_matter(collection):
     order = torch.randperm(len(labels), generator=torch.Generator().manual_seed(1))
     one = KernelHead().fit(histograms, labels)
     other = KernelHead().fit(histograms[order], labels[order])
-    torch.testing.assert_close(one(histograms), other(histograms), atol=1e-4, rtol=0)
+    assert_close(one(histograms), other(histograms), atol=1e-4, rtol=0)
 
 
 def test_kernel_head_is_kernel_ridge_regression(collection):
@@ -125,7 +125,7 @@ def test_kernel_head_is_kernel_ridge_regression(collection):
     oracle = KernelRidge(alpha=0.1, kernel="precomputed").fit(kernel[train], targets)
     expected = oracle.predict(kernel[test])
     found = head.scores(histograms[test])
-    np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert_allclose(found, expected, atol=2e-3)
     found = head.predict(histograms[test])
     np.testing.assert_array_equal(found, expected.argmax(axis=1))
 
@@ -136,7 +136,7 @@ def test_identical_shapes_have_no_direction():
     )
     head = WhitenedHead().fit(histograms, torch.tensor([0, 0, 1, 1]))
     centred = histograms.sqrt() - histograms.sqrt().mean(dim=0)
-    torch.testing.assert_close(head(histograms), normalize(centred))
+    assert_close(head(histograms), normalize(centred))
 
 
 def test_classes_keep_their_names(collection):
@@ -153,7 +153,7 @@ def test_state_round_trips_into_a_head_of_other_sizes(collection, kind):
     few = kind(n_directions=5).fit(histograms[::2, :9], labels[::2] % 3, (4, 3, 2))
     for copy in (kind(), kind(n_directions=5), few):
         copy.load_state_dict(state)
-        torch.testing.assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
+        assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
         for name, value in copy.state_dict().items():
             assert torch.equal(value, state[name]), name
 
@@ -222,13 +222,13 @@ def test_a_prior_stays_as_it_is(collection, prior, kind):
     before = {name: value.clone() for name, value in prior.state_dict().items()}
     head = kind(prior=prior).fit(histograms[labels < 4], labels[labels < 4], (30, 30))
     for name, value in prior.state_dict().items():
-        torch.testing.assert_close(value, before[name], rtol=0, atol=0)
+        assert_close(value, before[name], rtol=0, atol=0)
     found = head(histograms).norm(dim=1)
     expected = torch.ones(48)
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     copy = kind(prior=WhitenedHead())
     copy.load_state_dict(head.state_dict())
-    torch.testing.assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
+    assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
 
 
 class SteppedPrior(WhitenedHead):
@@ -253,9 +253,7 @@ def test_an_indefinite_kernel_is_projected_on_its_positive_eigenvectors(collecti
     oracle = KernelRidge(alpha=-values[0], kernel="precomputed").fit(
         projection @ kernel, np.eye(8)[labels]
     )
-    np.testing.assert_allclose(
-        head.scores(histograms), oracle.predict(kernel @ projection), atol=1e-4
-    )
+    assert_allclose(head.scores(histograms), oracle.predict(kernel @ projection), atol=1e-4)
 
 
 def test_whitened_distance_is_the_weighted_mean_with_the_priors(collection, prior, squared):
@@ -267,11 +265,9 @@ def test_whitened_distance_is_the_weighted_mean_with_the_priors(collection, prio
         head = WhitenedHead(prior=given, prior_share=0.3).fit(histograms, labels)
         beside = head(histograms)
         found = head.distances(beside, beside[:9])
-        torch.testing.assert_close(
-            found, (0.7 * cosine(own, own) + 0.3 * of_prior)[:, :9], atol=1e-6, rtol=0
-        )
+        assert_close(found, (0.7 * cosine(own, own) + 0.3 * of_prior)[:, :9], atol=1e-6, rtol=0)
         whole = 0.7 * cosine(own, own) + 0.3 * cosine(other, other)
-        torch.testing.assert_close(cosine(beside, beside), whole, atol=1e-6, rtol=0)
+        assert_close(cosine(beside, beside), whole, atol=1e-6, rtol=0)
     with pytest.raises(RuntimeError, match="WhitenedHead: expected to be fitted first"):
         WhitenedHead(prior=prior).distances(beside, beside)
 
@@ -301,9 +297,9 @@ def test_parts_beside_a_prior_are_weighted_by_fishers_discriminant(collection, s
     vectors = head.fit(descriptions[train], labels[train], cells)(descriptions)
     expected = 0.7 * own + 0.3 * squared.distances(squared(histograms), squared(histograms)).numpy()
     found = head.distances(vectors, vectors)
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert_allclose(found, expected, atol=1e-5)
     found = vectors.norm(dim=1)
-    torch.testing.assert_close(found, torch.ones(48))
+    assert_close(found, torch.ones(48))
 
 
 class Stretched(Head):
@@ -337,7 +333,7 @@ def test_without_separation_all_parts_have_equal_weights(collection, prior):
         alone = WhitenedHead().fit(shapes, labels, (20, 40))(histograms)
         found = beside(histograms)[:, :N_CELLS]
         expected = (2 / 3) ** 0.5 * alone
-        torch.testing.assert_close(found, expected)
+        assert_close(found, expected)
 
 
 @pytest.mark.parametrize("power", [1, 2])
@@ -358,9 +354,7 @@ def test_the_priors_kernel_is_one_more(collection, prior, squared, power):
     )
     given = prior if power == 1 else squared
     head = KernelHead(given, prior_share=0.25).fit(histograms[train], labels[train], (20, 40))
-    np.testing.assert_allclose(
-        head.scores(histograms[test]), oracle.predict(kernel[test]), atol=2e-3
-    )
+    assert_allclose(head.scores(histograms[test]), oracle.predict(kernel[test]), atol=2e-3)
 
 
 def test_one_shape_of_each_class_leaves_the_prior_alone(collection, prior):
@@ -373,7 +367,7 @@ def test_one_shape_of_each_class_leaves_the_prior_alone(collection, prior):
     head = KernelHead(prior).fit(histograms[::6], labels[::6])
     found = head.scores(histograms)
     expected = oracle.predict(kernel)
-    np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert_allclose(found, expected, atol=2e-3)
 
 
 @pytest.mark.parametrize(("n_of_each", "temperature"), [(3, 0.2), (6, 0.1), (24, 0.1)])
@@ -391,7 +385,7 @@ def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(
     likely = np.sqrt(softmax(scores / temperature, axis=1))
     expected = 1 - (about @ about.T + likely @ likely.T) / 2
     vectors = head(histograms)
-    np.testing.assert_allclose(cosine(vectors, vectors), expected, atol=1e-5)
+    assert_allclose(cosine(vectors, vectors), expected, atol=1e-5)
     hard = KernelHead(temperature=1e-6).fit(histograms[::2], labels[::2])
     assert torch.isfinite(hard(histograms)).all()  # as no exponential overflows
 
@@ -414,6 +408,6 @@ def test_fitted_heads_are_traced_whole_and_take_half_precision(collection):
         expected = head(histograms)
         torch.compiler.reset()
         traced = torch.compile(head, backend="aot_eager", fullgraph=True)
-        torch.testing.assert_close(traced(histograms), expected, rtol=0, atol=1e-5)
+        assert_close(traced(histograms), expected, rtol=0, atol=1e-5)
         halved = deepcopy(head).half()(histograms)
         assert float(torch.cosine_similarity(halved.float(), expected).min()) > 0.99

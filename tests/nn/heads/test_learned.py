@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.testing import assert_close
 
 from igps.descriptors.literature.d2 import D2
 from igps.nn.descriptor import EmbeddedDescriptor
@@ -26,7 +27,7 @@ def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(histograms)
     embedding = head(histograms)
     found = embedding.norm(dim=1)
     expected = torch.ones(12)
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     embedding[:, 0].sum().backward()
     assert histograms.grad is not None
     assert histograms.grad.isfinite().all()
@@ -44,7 +45,7 @@ def test_linear_head_with_identity_weights_ranks_like_hellingers_distance(histog
     roots = histograms.detach().flatten(1).sqrt()
     squared = torch.cdist(embedding, embedding).square()
     expected = torch.cdist(roots, roots).square()
-    torch.testing.assert_close(squared, expected, atol=1e-6, rtol=1e-5)
+    assert_close(squared, expected, atol=1e-6, rtol=1e-5)
 
 
 def test_fit_centres_and_scales(histograms):
@@ -53,14 +54,14 @@ def test_fit_centres_and_scales(histograms):
     inputs = (histograms.flatten(1).sqrt() - head.mean) / head.scale
     found = inputs.mean(dim=0)
     expected = torch.zeros(24)
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+    assert_close(found, expected, atol=1e-5, rtol=0)
     found = inputs.std(dim=0).mean()
     expected = torch.ones(())
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     linear = head.layers[1]
     embedding = head(histograms)
     expected = torch.nn.functional.normalize(linear(inputs), dim=1)
-    torch.testing.assert_close(embedding, expected)
+    assert_close(embedding, expected)
 
 
 def test_wrong_number_of_cells_is_named(histograms):
@@ -90,9 +91,7 @@ def test_share_goes_from_plain_to_learned(histograms):
         distance.calibrate(histograms)
         pairs = torch.triu_indices(12, 12, 1).unbind()
         result = distance(histograms, histograms)
-        torch.testing.assert_close(
-            result, expected / expected[pairs].median(), atol=1e-5, rtol=1e-4
-        )
+        assert_close(result, expected / expected[pairs].median(), atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -120,27 +119,25 @@ def test_the_head_alone_is_what_a_descriptor_under_it_deploys(histograms, make):
     expected = deployed.distances(vectors[:5], vectors)
     distance = BlendedDistance(head, share=1.0)
     found = distance(histograms[:5], histograms)
-    torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-4)
+    assert_close(found, expected, atol=1e-6, rtol=1e-4)
     distance.calibrate(histograms)
     pairs = torch.triu_indices(12, 12, 1).unbind()
     unit = deployed.distances(vectors, vectors)[pairs].median()
     assert unit > 0
-    torch.testing.assert_close(
-        distance(histograms[:5], histograms), expected / unit, atol=1e-5, rtol=1e-4
-    )
+    assert_close(distance(histograms[:5], histograms), expected / unit, atol=1e-5, rtol=1e-4)
 
 
 def test_without_head_it_is_the_paper(histograms):
     distance = BlendedDistance()
     distance.calibrate(histograms)
-    torch.testing.assert_close(
+    assert_close(
         distance(histograms, histograms), chi_square(histograms, histograms), atol=0, rtol=0
     )
 
 
 def test_plain_distance_may_be_another(histograms):
     flat = histograms.flatten(1)
-    torch.testing.assert_close(
+    assert_close(
         BlendedDistance(plain=euclidean)(flat, flat), euclidean(flat, flat), atol=0, rtol=0
     )
     head = ProjectionHead(width=4).eval()
@@ -151,7 +148,7 @@ def test_plain_distance_may_be_another(histograms):
         euclidean(flat, flat)
         / euclidean(flat, flat)[torch.triu_indices(12, 12, 1).unbind()].median()
     )
-    torch.testing.assert_close(distance(flat, flat), expected)
+    assert_close(distance(flat, flat), expected)
 
 
 def test_state_round_trips_into_one_without_sizes(histograms):
@@ -163,9 +160,7 @@ def test_state_round_trips_into_one_without_sizes(histograms):
     other_size = BlendedDistance(ProjectionHead().fit(histograms[:, :1], torch.zeros(12)).eval())
     for two in (BlendedDistance(ProjectionHead().eval()), other_size):
         two.load_state_dict(state)
-        torch.testing.assert_close(
-            two(histograms, histograms), one(histograms, histograms), atol=0, rtol=0
-        )
+        assert_close(two(histograms, histograms), one(histograms, histograms), atol=0, rtol=0)
         for name, value in two.state_dict().items():
             assert torch.equal(value, state[name]), name
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.linalg import sqrtm
+from torch.testing import assert_close
 
 from igps.nn.heads.two_level import TwoLevelHead
 from igps.nn.heads.wccn import WCCNHead
@@ -67,10 +68,10 @@ def test_parts_have_equal_shares_and_others_do_not_count(collection):
     found = head(histograms)
     # A part has at most as many directions as cells
     assert found.shape == (len(histograms), 12 + 10)
-    torch.testing.assert_close(cosine(found, found), expected, atol=2e-4, rtol=0)
+    assert_close(cosine(found, found), expected, atol=2e-4, rtol=0)
     changed = histograms.clone()
     changed[:, 12:30] = torch.rand(len(changed), 18, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(head(changed), found, atol=1e-6, rtol=0)
+    assert_close(head(changed), found, atol=1e-6, rtol=0)
 
 
 def test_with_lengths_distances_are_those_of_mahalanobis(collection):
@@ -80,10 +81,10 @@ def test_with_lengths_distances_are_those_of_mahalanobis(collection):
     head = WCCNHead(n_directions=10, shrinkage=0.2, lengths=True).fit(histograms.double(), bodies)
     found = head(histograms.double())
     assert found.shape == (len(histograms), 11)
-    torch.testing.assert_close(found.norm(dim=1), torch.ones(len(found), dtype=torch.float64))
+    assert_close(found.norm(dim=1), torch.ones(len(found), dtype=torch.float64))
     own = torch.pdist(found[:, :10])
     theirs = torch.pdist(expected)
-    torch.testing.assert_close(own / own.median(), theirs / theirs.median(), atol=1e-6, rtol=1e-6)
+    assert_close(own / own.median(), theirs / theirs.median(), atol=1e-6, rtol=1e-6)
     assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
 
 
@@ -99,13 +100,11 @@ def test_the_distance_is_what_the_formula_says(same_class, collection, monkeypat
     )
     head = TwoLevelHead(class_head, body_heads, scales=(0.2, 0.3), exponents=(0.3, 0.7), share=0.3)
     vectors = head.fit(histograms, classes, (15, 25), bodies=bodies)(histograms)
-    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
+    assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
     x, y, z = (one(histograms).double() for one in (class_head, *body_heads))
     products = 0.7 * x @ x.T + 0.15 * y @ y.T + 0.15 * z @ z.T
-    torch.testing.assert_close((vectors @ vectors.T).double(), products, atol=1e-5, rtol=0)
-    torch.testing.assert_close(
-        head.within_class(vectors)[:, :7].double(), 0.15**0.5 * y, atol=1e-6, rtol=0
-    )
+    assert_close((vectors @ vectors.T).double(), products, atol=1e-5, rtol=0)
+    assert_close(head.within_class(vectors)[:, :7].double(), 0.15**0.5 * y, atol=1e-6, rtol=0)
     first, second = (
         torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist")
         for one in (y, z)
@@ -125,8 +124,8 @@ def test_the_distance_is_what_the_formula_says(same_class, collection, monkeypat
         1 - torch.exp(-((apart / 0.1) ** 2))
     )
     found = head.distances(vectors, vectors).double()
-    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
-    torch.testing.assert_close(
+    assert_close(found, expected, atol=1e-4, rtol=0)
+    assert_close(
         head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0
     )
     assert ((all_near > 0.2) & (all_near < 0.9)).any()  # each case occurs
@@ -147,14 +146,12 @@ def test_body_heads_can_have_shapes_of_their_own(collection):
     of_class.fit(histograms[:200], classes[:200])
     of_body.fit(histograms[200:], bodies[200:])
     expected = 0.5**0.5 * torch.cat([of_class(histograms), of_body(histograms)], dim=1)
-    torch.testing.assert_close(head(histograms), expected)
+    assert_close(head(histograms), expected)
     # Of the shapes of classes
     _, _, axes = np.linalg.svd(expected[:200].double().numpy(), full_matrices=False)
     short = head.shorten(head(histograms))
     projected = torch.from_numpy(expected.double().numpy() @ axes.T)
-    torch.testing.assert_close(
-        cosine(short, short).double(), cosine(projected, projected), atol=1e-4, rtol=0
-    )
+    assert_close(cosine(short, short).double(), cosine(projected, projected), atol=1e-4, rtol=0)
 
 
 def test_distances_of_equal_vectors_have_a_gradient(collection):
@@ -219,7 +216,7 @@ def test_short_vectors_span_the_leading_singular_directions(collection, monkeypa
     vectors = head(histograms)
     short = head.shorten(vectors)
     assert short.shape[1] <= vectors.shape[1] <= 256
-    torch.testing.assert_close(cosine(short, short), cosine(vectors, vectors), atol=1e-5, rtol=0)
+    assert_close(cosine(short, short), cosine(vectors, vectors), atol=1e-5, rtol=0)
     monkeypatch.setattr("igps.nn.heads.two_level.MAX_SHORT_WIDTH", 7)
     found = head.fit(histograms, classes, bodies=bodies).shorten(vectors)
     assert found.shape == (len(vectors), 7)
@@ -237,17 +234,15 @@ def test_it_is_stored_and_loaded(collection):
     fitted.fit(histograms, classes, (15, 25), bodies=bodies)
     other = TwoLevelHead(WCCNHead((0,)), [WCCNHead((1,), lengths=True)])
     other.load_state_dict(fitted.state_dict())
-    torch.testing.assert_close(other(histograms), fitted(histograms))
+    assert_close(other(histograms), fitted(histograms))
     vectors = other(histograms)
     assert vectors.shape == (len(histograms), 5 + 6 + 1)
-    torch.testing.assert_close(
-        other.distances(vectors, vectors), fitted.distances(vectors, vectors)
-    )
-    torch.testing.assert_close(other.shorten(vectors), fitted.shorten(vectors))
+    assert_close(other.distances(vectors, vectors), fitted.distances(vectors, vectors))
+    assert_close(other.shorten(vectors), fitted.shorten(vectors))
     level = WCCNHead((1,))  # the state includes `lengths`
     level.load_state_dict(fitted.body_heads[0].state_dict())
     expected = fitted.body_heads[0](histograms)
-    torch.testing.assert_close(level(histograms), expected)
+    assert_close(level(histograms), expected)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
+from torch.autograd import grad
 from torch.nn.functional import normalize
+from torch.testing import assert_close
 
 from batches import N_POINTS, batch_of, embedded, two_bodies
 from igps.data.batch import SignatureBatch
@@ -175,7 +178,7 @@ def test_product_of_axes_equals_brute_force_loop(batch, name, kind):
         look = Look(batch, i, kind)
         memberships = product(*(classes(look) or [np.ones((n, 1))]))
         expected = pair_histogram_by_loops(memberships, pairs(look))
-        np.testing.assert_allclose(result[i], expected, atol=1e-6)
+        assert_allclose(result[i], expected, atol=1e-6)
 
 
 def learn(*modules):
@@ -220,7 +223,7 @@ def test_learned_axes_equal_brute_force_loop(batch, with_cosines):
             pairs.append((look.euclidean(2)[0], euclidean.centres().tolist()))
         expected = pair_histogram_by_loops(memberships, pairs)
         found = result[i].detach()
-        np.testing.assert_allclose(found, expected, atol=1e-6)
+        assert_allclose(found, expected, atol=1e-6)
 
 
 class DepthDifference(PairAxis):
@@ -249,7 +252,7 @@ def test_an_axis_of_ones_own_counts_values_of_its_own(batch):
         apart = np.abs(np.subtract.outer(depth, depth))
         axes = [look.interior(4), (apart, [0.0, 0.1, 0.5])]
         expected = pair_histogram_by_loops(look.potential(2), axes)
-        np.testing.assert_allclose(result[i], expected, atol=1e-6)
+        assert_allclose(result[i], expected, atol=1e-6)
 
 
 def test_defaults_are_the_papers_histogram(batch):
@@ -258,7 +261,7 @@ def test_defaults_are_the_papers_histogram(batch):
     for i in range(2):
         embedding = embedded(batch, i)
         expected = pair_histogram(embedding, embedding.norm(dim=1), n_classes=4, n_bins=64)
-        np.testing.assert_allclose(result[i], expected, atol=1e-5)
+        assert_allclose(result[i], expected, atol=1e-5)
 
 
 def test_names_are_axes(batch):
@@ -312,7 +315,7 @@ def test_a_trained_module_gives_the_same_without_gradient(batch):
     with torch.no_grad():
         without = histogram(batch)
     assert with_gradient.requires_grad
-    torch.testing.assert_close(with_gradient.detach(), without, atol=1e-6, rtol=0)
+    assert_close(with_gradient.detach(), without, atol=1e-6, rtol=0)
 
 
 def some(n_points, seed=0):
@@ -355,11 +358,11 @@ def test_padding_changes_neither_result_nor_gradient_of_the_samples(make, paddin
     single = embedding[::3].clone().requires_grad_()
     attributes = {"surface_direction": directions[None, ::3]}
     alone = layer(batch_of(single[None], None, points[None, ::3], attributes))
-    torch.testing.assert_close(batch[1], alone[0], rtol=0, atol=1e-14)
-    (expected,) = torch.autograd.grad(alone.square().sum(), single)
-    (gradient,) = torch.autograd.grad(batch[1].square().sum(), padded)
+    assert_close(batch[1], alone[0], rtol=0, atol=1e-14)
+    (expected,) = grad(alone.square().sum(), single)
+    (gradient,) = grad(batch[1].square().sum(), padded)
     found = gradient[1, ::3]
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    assert_close(found, expected, rtol=0, atol=1e-12)
     assert expected.abs().max() > 1e-6
 
 
@@ -381,7 +384,7 @@ def test_gradient_through_classes_and_layout():
         torch.randn(n, generator=generator, dtype=torch.float64, requires_grad=True) for n in (4, 3)
     ]
     leaves = (embedding, *parameters)
-    for gradient in torch.autograd.grad(histogram(*leaves).square().sum(), leaves):
+    for gradient in grad(histogram(*leaves).square().sum(), leaves):
         assert (gradient.abs() > 1e-6).any()
     assert torch.autograd.gradcheck(histogram, leaves)
 
@@ -414,24 +417,22 @@ def test_half_precision_and_autocast_count_in_single(device, cosines):
     def run(points):
         leaf = points.clone().requires_grad_()
         result = layer(batch_of(leaf[None]))
-        return result, list(torch.autograd.grad(result.square().sum(), [leaf, *layer.parameters()]))
+        return result, list(grad(result.square().sum(), [leaf, *layer.parameters()]))
 
     expected, expected_gradients = run(embedding.float())
     with torch.autocast(device, torch.bfloat16):
         result, gradients = run(embedding)
         hard = PairHistogram().to(device)(batch_of(embedding[None]))
     assert result.dtype == hard.dtype == torch.float32
-    torch.testing.assert_close(result, expected, rtol=0, atol=1e-6)
-    torch.testing.assert_close(hard, PairHistogram().to(device)(batch_of(embedding.float()[None])))
+    assert_close(result, expected, rtol=0, atol=1e-6)
+    assert_close(hard, PairHistogram().to(device)(batch_of(embedding.float()[None])))
     # What comes by way of the directions, on a GPU also of the potential, is rounded before it is summed, and partly
     # cancels.
     rounding = (
         0.01 * float(expected_gradients[0].abs().max()) if cosines or device == "cuda" else 1e-6
     )
-    torch.testing.assert_close(
-        gradients[0].float(), expected_gradients[0], rtol=0.01, atol=rounding
-    )
-    torch.testing.assert_close(gradients[1:], expected_gradients[1:], rtol=1e-4, atol=1e-7)
+    assert_close(gradients[0].float(), expected_gradients[0], rtol=0.01, atol=rounding)
+    assert_close(gradients[1:], expected_gradients[1:], rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -439,9 +440,7 @@ def test_half_precision_and_autocast_count_in_single(device, cosines):
 def test_cuda_equals_cpu(batch, name):
     histogram = PairHistogram(CASES[name][0](), SpectralEmbedding(n_eigenpairs=6))
     expected = histogram(batch)
-    torch.testing.assert_close(
-        histogram.cuda()(batch.to("cuda")).cpu(), expected, rtol=0, atol=1e-6
-    )
+    assert_close(histogram.cuda()(batch.to("cuda")).cpu(), expected, rtol=0, atol=1e-6)
 
 
 def test_impossible_histograms_are_refused():

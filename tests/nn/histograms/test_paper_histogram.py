@@ -6,6 +6,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 
 from igps.nn.histograms import pair_histogram
 
@@ -40,12 +41,12 @@ def test_equals_brute_force_loop(cloud, n_classes, n_bins):
     embedding, potential = cloud
     expected = by_loops(embedding.numpy(), potential.numpy(), 4.0, 1.5, n_classes, n_bins)
     result = pair_histogram(embedding, potential, n_classes=n_classes, n_bins=n_bins)
-    np.testing.assert_allclose(result, expected, atol=1e-12)
+    assert_allclose(result, expected, atol=1e-12)
     single = pair_histogram(
         embedding.float(), potential.float(), n_classes=n_classes, n_bins=n_bins
     )
     assert single.dtype == torch.float32
-    np.testing.assert_allclose(single, expected, atol=1e-6)
+    assert_allclose(single, expected, atol=1e-6)
 
 
 def test_values_beyond_the_ranges_stay_in_the_last_cells(cloud):
@@ -53,7 +54,7 @@ def test_values_beyond_the_ranges_stay_in_the_last_cells(cloud):
     far = pair_histogram(embedding * 100, potential * 100)
     assert far.sum() == pytest.approx(1)
     expected = by_loops(embedding.numpy() * 100, potential.numpy() * 100, 4.0, 1.5, 4, 64)
-    np.testing.assert_allclose(far, expected, atol=1e-12)
+    assert_allclose(far, expected, atol=1e-12)
     assert far[-1, -1] > 0.9
 
 
@@ -64,7 +65,7 @@ def test_does_not_depend_on_order_or_on_the_basis(cloud):
         torch.randn(6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     ).Q
     turned = pair_histogram(embedding[order] @ rotation, potential[order])
-    np.testing.assert_allclose(turned, pair_histogram(embedding, potential), atol=1e-10)
+    assert_allclose(turned, pair_histogram(embedding, potential), atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -108,4 +109,4 @@ def test_bad_layout_is_refused(cloud, name, value):
 def test_cuda_equals_cpu(cloud):
     embedding, potential = (values.float() for values in cloud)
     on_device = pair_histogram(embedding.cuda(), potential.cuda()).cpu()
-    np.testing.assert_allclose(on_device, pair_histogram(embedding, potential), atol=1e-6)
+    assert_allclose(on_device, pair_histogram(embedding, potential), atol=1e-6)

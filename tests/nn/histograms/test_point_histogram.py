@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from batches import alone, embedded, scaled, two_bodies
 from igps.nn import functional
@@ -55,16 +56,16 @@ def test_padding_and_scale_change_nothing():
     histogram = layout()
     found = histogram(batch)
     expected = torch.ones(2)
-    torch.testing.assert_close(found.flatten(1).sum(dim=1), expected)
+    assert_close(found.flatten(1).sum(dim=1), expected)
     for i in range(2):
-        torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
-    torch.testing.assert_close(histogram(scaled(batch, 3.0)), found, atol=1e-5, rtol=0)
+        assert_close(histogram(alone(batch, i))[0], found[i])
+    assert_close(histogram(scaled(batch, 3.0)), found, atol=1e-5, rtol=0)
 
 
 def test_a_subset_of_the_samples_is_counted():
     batch = two_bodies()
     expected = layout()(replace(batch, surface=batch.surface.subset(20, seed=0)))
-    torch.testing.assert_close(layout(n_samples=20)(batch), expected)
+    assert_close(layout(n_samples=20)(batch), expected)
 
 
 def test_what_it_cannot_count_is_named():

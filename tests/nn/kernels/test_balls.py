@@ -9,6 +9,7 @@ import torch
 import trimesh
 from torch import Tensor
 from torch.nn.functional import normalize
+from torch.testing import assert_close
 
 from igps.nn import functional
 
@@ -79,7 +80,7 @@ def test_a_ball_has_its_own_radius_inside_and_none_outside(ball_radii):
     radii = ball_radii(0.3 * points, points)
     found = radii[:, 0]
     expected = torch.full((500,), 0.3)
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+    assert_close(found, expected, rtol=1e-3, atol=0)
     assert (radii[:, 1] == 10).all()
 
 
@@ -107,7 +108,7 @@ def test_two_points_inside_a_ball_do_not_change_the_other_radii(ball_radii):
     points[:2] *= 0.5
     radii = ball_radii(points, directions)[2:, 0]
     expected = torch.ones(398)
-    torch.testing.assert_close(radii, expected, rtol=1e-3, atol=0)
+    assert_close(radii, expected, rtol=1e-3, atol=0)
 
 
 def test_three_samples_are_enough_and_two_are_not(ball_radii):
@@ -149,6 +150,6 @@ def test_padding_does_not_change_radii(ball_radii):
             ).detach()
             assert (found[1, 11:] == 1).all()
             for i, n in enumerate((30, 11)):
-                torch.testing.assert_close(
+                assert_close(
                     found[i, :n], ball_radii(points[i, :n], directions[i, :n]), rtol=1e-3, atol=0
                 )

@@ -2,6 +2,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.autograd import grad
+from torch.testing import assert_close
 
 from batches import alone, two_bodies
 from igps.data.batch import SignatureBatch
@@ -38,7 +40,7 @@ def test_groups_are_padded_to_their_largest_body(copies, on_cpu, widths, monkeyp
         return group.interior.points.sum(dim=(1, 2))
 
     expected = batch.interior.points.sum(dim=(1, 2))
-    torch.testing.assert_close(map_by_size(sums, batch), expected)
+    assert_close(map_by_size(sums, batch), expected)
     assert found == widths
 
 
@@ -68,15 +70,13 @@ def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several):
         result = descriptor(
             replace(batch, interior=replace(batch.interior, eigenfunctions=functions))
         )
-        return result.detach(), torch.autograd.grad(result.square().sum(), functions)[0]
+        return result.detach(), grad(result.square().sum(), functions)[0]
 
     descriptions, gradients = described(batch)
     for i in range(3):
         description, gradient = described(alone(batch, i))
-        torch.testing.assert_close(descriptions[i], description[0], rtol=0, atol=1e-6)
-        torch.testing.assert_close(
-            gradients[i, : gradient.shape[1]], gradient[0], rtol=1e-4, atol=1e-7
-        )
+        assert_close(descriptions[i], description[0], rtol=0, atol=1e-6)
+        assert_close(gradients[i, : gradient.shape[1]], gradient[0], rtol=1e-4, atol=1e-7)
         assert not gradients[i, gradient.shape[1] :].any()
 
 
@@ -89,13 +89,13 @@ def test_second_derivatives_of_a_mixed_batch_are_those_of_each_body():
         result = descriptor(
             replace(batch, interior=replace(batch.interior, eigenfunctions=functions))
         )
-        gradient = torch.autograd.grad(result.square().sum(), functions, create_graph=True)[0]
-        return torch.autograd.grad(gradient.square().sum(), functions)[0]
+        gradient = grad(result.square().sum(), functions, create_graph=True)[0]
+        return grad(gradient.square().sum(), functions)[0]
 
     found = second_derivatives(batch)
     for i in range(3):
         expected = second_derivatives(alone(batch, i))[0]
         assert expected.any()
-        torch.testing.assert_close(
+        assert_close(
             found[i, : len(expected), : expected.shape[1]], expected, rtol=1e-6, atol=1e-12
         )

@@ -6,8 +6,11 @@ from itertools import combinations_with_replacement
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
+from torch.autograd import grad
 from torch.nn.functional import normalize, one_hot
 from torch.nn.utils.rnn import pad_sequence
+from torch.testing import assert_close
 from torch.utils.flop_counter import FlopCounterMode
 
 from conftest import torch_threads
@@ -153,11 +156,11 @@ def test_histogram_is_the_sum_of_hats_over_all_pairs(device, layout, n_classes, 
     result = counted(layout, {name: value.to(device) for name, value in given.items()}).cpu()
     axes = [axis for kind in layout for axis in KINDS[kind][1](given)]
     expected = pair_histogram_by_loops(given["memberships"], axes)
-    np.testing.assert_allclose(result, expected, atol=1e-12)
+    assert_allclose(result, expected, atol=1e-12)
     assert float(result.sum()) == pytest.approx(1, abs=1e-12)
     single = counted(layout, {name: value.float().to(device) for name, value in given.items()})
     assert single.dtype == torch.float32
-    np.testing.assert_allclose(single.cpu(), result, atol=1e-6)
+    assert_allclose(single.cpu(), result, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +178,7 @@ def test_any_spacing_of_centres_is_exact(device, layout):
     result = joint_histogram(given["memberships"].to(device), [pairs])
     axis = (distances(given["coordinates"]), layout)
     expected = pair_histogram_by_loops(given["memberships"], [axis])
-    np.testing.assert_allclose(result.cpu(), expected, atol=1e-12)
+    assert_allclose(result.cpu(), expected, atol=1e-12)
 
 
 def test_single_precision_is_summed_in_double(device):
@@ -184,7 +187,7 @@ def test_single_precision_is_summed_in_double(device):
     result = counted(["many"], {name: value.float() for name, value in given.items()})
     assert float(result.sum()) == pytest.approx(1, abs=1e-6)
     expected = counted(["many"], given).cpu()
-    np.testing.assert_allclose(result.cpu(), expected, atol=1e-7)
+    assert_allclose(result.cpu(), expected, atol=1e-7)
 
 
 @pytest.mark.parametrize("layout", [EQUAL, MANY])
@@ -200,7 +203,7 @@ def test_whole_pairs_of_single_precision_are_as_those_of_double(layout):
         )
         for dtype in (torch.float32, torch.float64)
     )
-    np.testing.assert_allclose(result, expected, atol=1e-7)
+    assert_allclose(result, expected, atol=1e-7)
 
 
 @pytest.mark.parametrize(("spread", "bin_of_all"), [(0.0, 0), (1e4, 4)])
@@ -229,7 +232,7 @@ def test_features_are_those_of_a_loop():
     for feature, one in zip(
         point_pair_features(given["points"], given["directions"]), expected, strict=True
     ):
-        np.testing.assert_allclose(feature, one[i, j], atol=1e-12)
+        assert_allclose(feature, one[i, j], atol=1e-12)
 
 
 def test_points_that_coincide_have_no_line(device):
@@ -257,7 +260,7 @@ def test_a_reflection_turns_the_order_of_twists(device):
     assert float((counts - counts.flip(-1)).abs().max()) > 1e-3
     found = counted(["equal", "twists"], mirrored)
     expected = counts.flip(-1)
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
 
 
 @pytest.mark.parametrize("layout", [["few", "cosines"]])
@@ -271,7 +274,7 @@ def test_turning_moving_and_reordering_change_nothing(device, layout):
         counted(layout, {name: value.to(device) for name, value in one.items()})
         for one in (given, moved, {**given, "directions": -given["directions"]})
     )
-    torch.testing.assert_close(found, expected, atol=1e-9, rtol=0)
+    assert_close(found, expected, atol=1e-9, rtol=0)
     assert (inwards - expected).abs().sum() > 0.1
 
 
@@ -293,7 +296,7 @@ def test_no_cell_is_negative(device, joint):
         [euclidean_distances(one.to(device), layout) for one in axes],
     )
     assert result.min() >= 0
-    torch.testing.assert_close(
+    assert_close(
         result.flatten(1).sum(dim=1), torch.ones(len(length), device=device), atol=1e-6, rtol=0
     )
 
@@ -331,7 +334,7 @@ def test_shapes_of_any_sizes_are_counted_as_alone(device):
         expected = joint_histogram(
             one["memberships"], [euclidean_distances(one["coordinates"], layout)]
         )
-        torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+        assert_close(found, expected, rtol=0, atol=1e-12)
 
 
 def test_threads_change_no_bit(many_cores):
@@ -349,7 +352,7 @@ def test_threads_change_no_bit(many_cores):
             leaves = [
                 given[name] for name in ("memberships", "coordinates", "points", "directions")
             ]
-            results.append([histogram.detach(), *torch.autograd.grad(histogram, leaves, upstream)])
+            results.append([histogram.detach(), *grad(histogram, leaves, upstream)])
             assert torch.get_num_threads() == n_threads
     for other in results[1:]:
         for one, same in zip(results[0], other, strict=True):
@@ -408,12 +411,12 @@ def test_gradients_equal_those_of_the_dense_definition(device, layout, block):
         result.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64
     ).to(device)
     for by_hand, by_torch in zip(
-        torch.autograd.grad(result, leaves, upstream, retain_graph=True),
-        torch.autograd.grad(expected, leaves, upstream),
+        grad(result, leaves, upstream, retain_graph=True),
+        grad(expected, leaves, upstream),
         strict=True,
     ):
         assert (by_torch.abs() > 1e-9).any()
-        torch.testing.assert_close(by_hand, by_torch, rtol=1e-9, atol=1e-13)
+        assert_close(by_hand, by_torch, rtol=1e-9, atol=1e-13)
 
 
 @pytest.mark.parametrize("layout", [["many"], ["few", "own"], ["few", "cosines"], ["twists"]])
@@ -431,7 +434,7 @@ def test_gradcheck(device, layout):
             layout, {**{name: value.to(device) for name, value in given.items()}, **moved}
         )
 
-    for gradient in torch.autograd.grad(histogram(*leaves).square().sum(), leaves):
+    for gradient in grad(histogram(*leaves).square().sum(), leaves):
         assert (gradient.abs() > 1e-9).any()
     # A GPU adds in any order.
     some_order = 1e-12 if device == "cuda" else 0
@@ -443,10 +446,10 @@ def test_gradcheck(device, layout):
 def test_gradients_taken_under_autocast_keep_their_digits(layout):
     given = {name: value.float().requires_grad_() for name, value in some(30).items()}
     leaves = [given["coordinates" if layout == ["many"] else "points"]]
-    [expected] = torch.autograd.grad(counted(layout, given).square().sum(), leaves)
+    [expected] = grad(counted(layout, given).square().sum(), leaves)
     with torch.autocast("cpu", torch.bfloat16):
-        [found] = torch.autograd.grad(counted(layout, given).square().sum(), leaves)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))
+        [found] = grad(counted(layout, given).square().sum(), leaves)
+    assert_close(found, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))
 
 
 def test_coincident_points_have_finite_gradients(device):
@@ -455,12 +458,12 @@ def test_coincident_points_have_finite_gradients(device):
     embedding.requires_grad_()
     layout = centres([-0.1, 0.3, 1.0], embedding)  # a slope at distance 0
     result = joint_histogram(embedding.new_ones(6, 1), [euclidean_distances(embedding, layout)])
-    near, far = (torch.autograd.grad(result[0, k], embedding, retain_graph=True)[0] for k in (0, 2))
+    near, far = (grad(result[0, k], embedding, retain_graph=True)[0] for k in (0, 2))
     assert torch.isfinite(near).all()
     # 9 of the 15 pairs are at √0.75; pulling one point away along the diagonal stretches 3 of them by 1/√3 each axis.
     found = far[3:].cpu()
     expected = 3 / 15 / 0.7 / math.sqrt(3)
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert_allclose(found, expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
