@@ -11,7 +11,6 @@ from urllib.parse import unquote
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from igps._arrays import Floats
 from igps.mesh.limits import check_unpacked
@@ -69,7 +68,7 @@ def objects(
     check_unpacked(sum(sizes[name] for _, _, name in nodes), path, options.max_unpacked)
     surfaces: dict[str, list[RawBody]] = {}
     for node, matrix, name in nodes:
-        surface = _surface(scene, scene.geometry[name], matrix)
+        surface = _surface(scene.geometry[name], matrix)
         if surface is not None:
             surfaces.setdefault(_node_in_file(scene, node), []).append(surface)
     if not surfaces:
@@ -86,33 +85,16 @@ def _node_in_file(scene: trimesh.Scene, node: str) -> str:
     return str(parent if is_material else node)
 
 
-def _surface(scene: trimesh.Scene, geometry: Any, matrix: Floats) -> RawBody | None:
+def _surface(geometry: Any, matrix: Floats) -> RawBody | None:
     """Return the surface or the points of a node, placed by its matrix (4, 4); None for lines."""
     vertices = np.asarray(geometry.vertices, dtype=np.float64)
     if not np.array_equal(matrix, np.eye(4)):
         vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     if isinstance(geometry, trimesh.PointCloud):
-        columns = ply_columns(scene)
-        normals = [columns[name] for name in ("nx", "ny", "nz") if name in columns]
-        if len(normals) < 3:
-            return RawBody(vertices)
-        return RawBody(vertices, normals=np.hstack(normals).astype(np.float64))
+        return RawBody(vertices)
     if not isinstance(geometry, trimesh.Trimesh):
         return None
     faces = np.asarray(geometry.faces, dtype=np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0:  # the matrix mirrors: turned back
         faces = faces[:, ::-1]
     return RawBody(vertices, np.ascontiguousarray(faces))
-
-
-def ply_columns(scene: trimesh.Scene) -> dict[str, NDArray[Any]]:
-    """Return the properties of the vertices of a PLY file, (V, C) by name, from trimesh's metadata."""
-    raw = (
-        item.metadata.get("_ply_raw", {}).get("vertex", {})
-        for item in (scene, *scene.geometry.values())
-    )
-    vertex: dict[str, Any] = next((x for x in raw if "data" in x), {"properties": ()})
-    return {
-        name: np.asarray(vertex["data"][name]).reshape(vertex["length"], -1)
-        for name in vertex["properties"]
-    }

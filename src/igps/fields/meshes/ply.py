@@ -1,13 +1,19 @@
-"""PLY as text or bytes: point clouds and triangles are read by trimesh, polygons of several sizes and strips here."""
+"""PLY: vertices with properties, polygons and strips of triangles, as text or bytes.
 
-import re
+Trimesh is not used: it reads no polygons of several sizes, and no strips.
+"""
+
 import struct
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from igps._arrays import Floats, Surface
+from igps._arrays import Floats, Integers
 from igps.mesh.formats import Format
 from igps.mesh.options import LoadOptions
 from igps.mesh.polygons import flat_triangles, strip_triangles
@@ -32,16 +38,30 @@ _TYPES = {
     "float32": "f",
     "float64": "d",
 }
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+_TEXT = "="  # in place of an order of bytes
+_ORDERS = {"ascii": _TEXT, "binary_little_endian": "<", "binary_big_endian": ">"}
 _CORNERS = ("vertex_index", "vertex_indices")
-_HAS_FACES = re.compile(rb"element\s+(face|tristrips)\s+0*[1-9]")
+
+Numbers = tuple[Any, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """A property of all rows of an element: its numbers laid end to end, and how many each row has."""
+
+    numbers: NDArray[np.generic]
+    lengths: Integers  # 1 for a single value
+
+
+Columns = Mapping[str, Column]
 
 
 @dataclass(frozen=True)
 class _Property:
     name: str
-    kind: str  # type code
-    length_kind: str = ""  # type code of the length of a list; "" for a single value
+    kind: str  # order of bytes and type code of its numbers
+    length_kind: str  # the same of the length of a list; "" for a single value
+    type: str  # of its numbers in a column
 
 
 @dataclass
@@ -50,162 +70,162 @@ class _Element:
     count: int
     properties: list[_Property] = field(default_factory=list)
 
-    @property
-    def corners_at(self) -> int:
-        """Index of the list of corners among the properties, -1 if there is none."""
-        names = [known.name for known in self.properties]
-        found = [at for at, name in enumerate(names) if name in _CORNERS]
-        return found[0] if found else -1
+
+def elements(path: Path) -> dict[str, Columns]:
+    """Return the columns of each element; a ValueError if the file is longer or shorter than its header says."""
+    head, _, content = path.read_bytes().partition(b"end_header")
+    content = content.partition(b"\n")[2]
+    order, declared = _header(head.decode("latin-1"))
+    if order == _TEXT:
+        content = np.fromstring(content, sep=" ").tobytes()
+    found: dict[str, Columns] = {}
+    at = 0
+    for element in declared:
+        fault = f"expected {element.count} rows of {element.name}, got fewer"
+        if not 0 <= element.count <= len(content):  # a row takes at least a byte
+            raise ValueError(fault)
+        try:
+            found[element.name], at = _columns(content, at, element)
+        except struct.error as error:
+            raise ValueError(fault) from error
+    if at != len(content):
+        raise ValueError(f"expected {at} bytes of numbers, got {len(content)}")
+    return found
 
 
-@dataclass
-class _Header:
-    order: str = ""  # of bytes, "<" or ">"; "" for text
-    elements: list[_Element] = field(default_factory=list)
+def _header(text: str) -> tuple[str, list[_Element]]:
+    """Return the order of bytes, and the elements."""
+    first, *lines = text.splitlines()
+    if first.strip() != "ply":
+        raise ValueError("its first line is not ply")
+    order = ""
+    declared: list[_Element] = []
+    for line in lines:
+        words = line.split()
+        if words[:1] == ["format"]:
+            order = _ORDERS[words[1]]
+        elif words[:1] == ["element"]:
+            declared.append(_Element(words[1], int(words[2])))
+        elif words[:1] == ["property"]:
+            declared[-1].properties.append(_property(words, order))
+    return order, declared
 
-    @classmethod
-    def parsed(cls, text: str) -> "_Header":
-        header = cls()
-        for line in text.splitlines():
-            words = line.split()
-            if words[:1] == ["format"]:
-                header.order = _ORDERS.get(words[1], "")
-            elif words[:1] == ["element"]:
-                header.elements.append(_Element(words[1], int(words[2])))
-            elif words[:2] == ["property", "list"]:
-                of_list = _Property(words[4], _TYPES[words[3]], _TYPES[words[2]])
-                header.elements[-1].properties.append(of_list)
-            elif words[:1] == ["property"]:
-                single = _Property(words[2], _TYPES[words[1]])
-                header.elements[-1].properties.append(single)
-        return header
+
+def _property(words: list[str], order: str) -> _Property:
+    """Return the property of a line of the header. Text is stored as if it were bytes in double precision."""
+    *length, word, name = words[1:]
+    code = _TYPES[word]
+    stored = "d" if order == _TEXT else code
+    length_kind = ""
+    if length:  # the word "list", and the type of the length
+        length_kind = order + ("d" if order == _TEXT else _TYPES[length[1]])
+    return _Property(name, order + stored, length_kind, "f" if code == "f" else stored)
+
+
+def _columns(content: bytes, at: int, element: _Element) -> tuple[Columns, int]:
+    """Return the columns of an element whose rows begin at `at`, and where they end."""
+    if not element.count:
+        return {}, at
+    first, behind_first = _row(content, at, element)
+    end = at + element.count * (behind_first - at)
+    if end <= len(content):
+        rows = np.frombuffer(content, _row_type(element, first), element.count, at)
+        if _has_even_lists(rows, element, first):
+            return _even_columns(rows, element), end
+    parts: list[list[Numbers]] = [[] for _ in element.properties]
+    for _ in range(element.count):
+        row, at = _row(content, at, element)
+        for own, numbers in zip(parts, row, strict=True):
+            own.append(numbers)
+    columns = {}
+    for known, own in zip(element.properties, parts, strict=True):
+        numbers = np.array(list(chain.from_iterable(own)), known.type)
+        columns[known.name] = Column(numbers, np.array([len(row) for row in own]))
+    return columns, at
+
+
+def _row(content: bytes, at: int, element: _Element) -> tuple[list[Numbers], int]:
+    """Return the numbers of each property in the row that begins at `at`, and where the row ends."""
+    row = []
+    for known in element.properties:
+        n = 1
+        if known.length_kind:
+            n = int(struct.unpack_from(known.length_kind, content, at)[0])
+            at += struct.calcsize(known.length_kind)
+        layout = f"{known.kind[0]}{n}{known.kind[1]}"
+        row.append(struct.unpack_from(layout, content, at))
+        at += struct.calcsize(layout)
+    return row, at
+
+
+def _row_type(element: _Element, first: list[Numbers]) -> np.dtype[np.void]:
+    """Return the type of rows whose lists are as long as those of the first row."""
+    fields: list[Any] = []
+    for known, numbers in zip(element.properties, first, strict=True):
+        if known.length_kind:
+            fields.append((_length_of(known), known.length_kind))
+        fields.append((known.name, known.kind, (len(numbers),)))
+    return np.dtype(fields)
+
+
+def _length_of(known: _Property) -> str:
+    return f"length of {known.name}"
+
+
+def _has_even_lists(rows: NDArray[Any], element: _Element, first: list[Numbers]) -> bool:
+    """Return whether the lists of all rows are as long as those of the first row."""
+    for known, numbers in zip(element.properties, first, strict=True):
+        if known.length_kind and (rows[_length_of(known)] != len(numbers)).any():
+            return False
+    return True
+
+
+def _even_columns(rows: NDArray[Any], element: _Element) -> Columns:
+    columns = {}
+    for known in element.properties:
+        numbers = rows[known.name].astype(known.type)
+        lengths = np.full(len(rows), numbers.shape[1])
+        columns[known.name] = Column(numbers.ravel(), lengths)
+    return columns
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    head, end, body = path.read_bytes().partition(b"end_header")
-    try:
-        surface = _surface(head.decode("latin-1"), body.partition(b"\n")[2])
-    except (ValueError, KeyError, IndexError, struct.error):
-        surface = None  # a rare file, or a broken one: trimesh names the fault
-    if surface is not None:
-        return [RawBody(*surface)]
-    from igps.fields.meshes._trimesh import objects
-
-    # Trimesh expects a header in UTF-8. Without fix_texture=False, it splits vertices at the seams of textures
-    content = head.decode("latin-1").encode("ascii", "replace") + end + body
-    bodies = objects(path, options, content, fix_texture=False)
-    if _HAS_FACES.search(head) and not any(len(x.faces) for x in bodies):  # not a point cloud
-        raise ValueError("it declares faces, but none can be read; export it as triangles, in text")
-    return bodies
-
-
-def _surface(head: str, body: bytes) -> Surface | None:
-    """Read strips of triangles, or polygons of several sizes; return None for files that trimesh can read."""
-    header = _Header.parsed(head)
-    if [element.name for element in header.elements[:2]] not in (
-        ["vertex", "face"],
-        ["vertex", "tristrips"],
-    ):
-        return None
-    points, faces = header.elements[:2]
-    has_lists = any(known.length_kind for known in points.properties)
-    if has_lists or faces.corners_at < 0 or min(points.count, faces.count) < 1:
-        return None
-    if header.order:
-        if _are_triangles(body, points, faces, header.order):
-            return None
-        vertices, polygons = _read_binary(body, points, faces, header.order)
-    else:
-        lines = [line for line in body.splitlines() if line and not line.isspace()]
-        n_lines = points.count + faces.count
-        if len(lines) < n_lines:  # trimesh would silently read a part
-            raise EOFError(f"expected {n_lines} vertices and faces, got {len(lines)} lines")
-        rows = lines[points.count : n_lines]
-        if _are_triangle_lines(rows, faces):
-            return None
-        vertices = _text_vertices(lines[: points.count], points)
-        polygons = [_text_polygon(row.split(), faces) for row in rows]
-    n_corners = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
-    corners = np.array([corner for polygon in polygons for corner in polygon], dtype=np.int64)
-    if faces.name == "tristrips":  # -1 separates strips within a list
-        lists = np.split(corners, np.cumsum(n_corners)[:-1])
-        strips = [strip for row in lists for strip in np.split(row, np.flatnonzero(row < 0))]
-        return vertices, np.concatenate([strip_triangles(strip[strip >= 0]) for strip in strips])
-    return vertices, flat_triangles(corners, n_corners, vertices)
+    found = elements(path)
+    points = found["vertex"]
+    vertices = _vectors(points, ("x", "y", "z"))
+    faces = [np.zeros((0, 3), dtype=np.int64)]
+    for name in ("face", "tristrips"):
+        rows = found.get(name)
+        if not rows:
+            continue
+        lists = [rows[known] for known in _CORNERS if known in rows]
+        if not lists:
+            raise ValueError("it declares faces, and no corners of them; export it as triangles")
+        corners = lists[0].numbers.astype(np.int64)
+        if (corners != lists[0].numbers).any():
+            raise ValueError("a corner of a face is no whole number")
+        if name == "face":
+            faces.append(flat_triangles(corners, lists[0].lengths, vertices))
+        else:
+            faces += _strips(corners, lists[0].lengths)
+    triangles = np.concatenate(faces)
+    normals = None
+    if not len(triangles) and {"nx", "ny", "nz"} <= points.keys():
+        normals = _vectors(points, ("nx", "ny", "nz"))
+    return [RawBody(vertices, triangles, normals=normals)]
 
 
-def _are_triangle_lines(rows: list[bytes], faces: _Element) -> bool:
-    """Return whether all polygons are triangles, which trimesh reads many times faster."""
-    return not _has_other_lists(faces) and all(
-        row.split(None, faces.corners_at + 1)[faces.corners_at] == b"3" for row in rows
-    )
+def _vectors(points: Columns, names: Sequence[str]) -> Floats:
+    return np.stack([points[name].numbers for name in names], axis=1).astype(np.float64)
 
 
-def _are_triangles(body: bytes, points: _Element, faces: _Element, order: str) -> bool:
-    """Return whether all polygons are triangles, which trimesh reads many times faster."""
-    if _has_other_lists(faces):
-        return False
-    fields = []
-    for at, known in enumerate(faces.properties):
-        fields.append((f"{at}", order + (known.length_kind or known.kind)))
-        if at == faces.corners_at:
-            fields.append(("corners", f"3{order}{known.kind}"))
-    row_type = np.dtype(fields)
-    start = points.count * _vertex_type(points, order).itemsize
-    if len(body) - start < faces.count * row_type.itemsize:
-        return False
-    rows = np.frombuffer(body, row_type, faces.count, start)
-    return bool((rows[f"{faces.corners_at}"] == 3).all())
-
-
-def _has_other_lists(faces: _Element) -> bool:
-    """Return whether faces have lists beside that of the corners, such as texture coordinates."""
-    others = [known for known in faces.properties if known.name not in _CORNERS]
-    return any(known.length_kind for known in others)
-
-
-def _text_vertices(lines: list[bytes], points: _Element) -> Floats:
-    names = [known.name for known in points.properties]
-    columns = [names.index(axis) for axis in "xyz"]
-    return np.loadtxt(
-        lines, np.float64, comments=None, usecols=columns, ndmin=2, encoding="latin-1"
-    )
-
-
-def _text_polygon(words: list[bytes], faces: _Element) -> list[int]:
-    """Return the corners of a polygon from the words of its line."""
-    start = 0
-    for known in faces.properties[: faces.corners_at]:
-        start += 1 + int(words[start]) if known.length_kind else 1
-    end = start + 1 + int(words[start])
-    if end > len(words):
-        raise ValueError(f"expected {end} numbers for a face, got {len(words)}")
-    return [int(word) for word in words[start + 1 : end]]
-
-
-def _vertex_type(points: _Element, order: str) -> np.dtype[np.void]:
-    return np.dtype([(known.name, order + known.kind) for known in points.properties])
-
-
-def _read_binary(
-    body: bytes, points: _Element, faces: _Element, order: str
-) -> tuple[Floats, list[list[int]]]:
-    """Return the vertices (V, 3), and the corners of each polygon."""
-    rows = np.frombuffer(body, _vertex_type(points, order), points.count)
-    vertices = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    offset = rows.nbytes
-    polygons = []
-    for _ in range(faces.count):
-        for at, known in enumerate(faces.properties):
-            n_values = 1
-            if known.length_kind:
-                (n_values,) = struct.unpack_from(order + known.length_kind, body, offset)
-                offset += struct.calcsize(order + known.length_kind)
-            layout = f"{order}{n_values}{known.kind}"
-            if at == faces.corners_at:
-                polygons.append(list(struct.unpack_from(layout, body, offset)))
-            offset += struct.calcsize(layout)
-    return vertices, polygons
+def _strips(corners: Integers, lengths: Integers) -> list[Integers]:
+    """Return the triangles of each strip; -1 separates strips within a list."""
+    triangles = []
+    for row in np.split(corners, np.cumsum(lengths)[:-1]):
+        for strip in np.split(row, np.flatnonzero(row < 0)):
+            triangles.append(strip_triangles(strip[strip >= 0]))
+    return triangles
 
 
 FORMAT = Format("PLY", (".ply",), read)

@@ -1,14 +1,13 @@
 """Readers of values at the vertices of surfaces."""
 
 from collections.abc import Mapping
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Floats
-from igps.fields.meshes import brains, vtk
+from igps.fields.meshes import brains, ply, vtk
 from igps.mesh.errors import MeshError
 from igps.mesh.options import LoadOptions
 
@@ -49,19 +48,11 @@ def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
 
 def _ply(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read the properties of vertices other than coordinates, normals and colours."""
-    import trimesh
-
-    from igps.fields.meshes._trimesh import ply_columns
-
-    scene = trimesh.load_scene(
-        BytesIO(path.read_bytes()), file_type="ply", process=False, fix_texture=False
-    )
-    columns = ply_columns(scene).items()
     ignored = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
     return {
-        name: values[:, 0] if values.shape[1] == 1 else values
-        for name, values in columns
-        if name not in ignored
+        name: column.numbers
+        for name, column in ply.elements(path)["vertex"].items()
+        if name not in ignored and (column.lengths == 1).all()
     }
 
 
