@@ -62,8 +62,8 @@ def eliminate(
 ) -> tuple[int, int]:
     """Eliminate a range of nodes; return the number of negative pivots, and the node where the elimination stopped.
 
-    It stops before the end of the range at a node with more than ``max_own`` own unknowns, or whose pivots must be
-    taken in another order. The front of that node is assembled.
+    It stops before the end of the range at a node with more than ``max_own`` own unknowns, or whose pivots lose
+    too many digits in their order. The front of that node is assembled.
     """
     n_negative = 0
     own_start = tree.nodes[OWN]

@@ -94,15 +94,12 @@ def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np
 
 
 @compiled()
-def load(
-    matrix: np.ndarray, front: np.ndarray, n: int, front_width: int, width: int, is_reversed: bool
-) -> None:
+def load(matrix: np.ndarray, front: np.ndarray, n: int, front_width: int, width: int) -> None:
     """Copy a symmetric matrix (n, width) from the upper triangle of a front, and pad its rows with zeros."""
     for i in range(n):
         for j in range(i, n):
             value = front[i * front_width + j]
-            row, column = (n - 1 - i, n - 1 - j) if is_reversed else (i, j)
-            matrix[row * width + column] = matrix[column * width + row] = value
+            matrix[i * width + j] = matrix[j * width + i] = value
         for j in range(n, width):
             matrix[i * width + j] = 0.0
 
@@ -137,26 +134,15 @@ def invert_front(scratch: Scratch, n: int, front_width: int, width: int) -> int:
     """Write the inverse (n, width) of a front's pivot block to `scratch`; return the number of its negative pivots.
 
     Return -1 on failure. A definite block is inverted accurately with its pivots in any order. An indefinite block may
-    lose digits in one order, rarely also in the reverse order; the norm of I − A X measures the loss. If it is small,
-    the signs of the pivots are right, too: no eigenvalue crosses zero between A and the matrix whose inverse is X.
+    lose digits; the norm of I − A X measures the loss. If it is small, the signs of the pivots are right, too: no
+    eigenvalue crosses zero between A and the matrix whose inverse is X.
     """
     inverse = scratch.inverse
-    for is_reversed in (False, True):
-        load(inverse, scratch.front, n, front_width, width, is_reversed)
-        n_negative = invert(inverse, n, width, scratch.rows, scratch.columns)
-        if n_negative > 0:
-            load(scratch.pivot_copy, scratch.front, n, front_width, width, is_reversed)
-            if (
-                not residual_norm(scratch.pivot_copy, inverse, n, width, scratch.residual)
-                <= MAX_RESIDUAL
-            ):
-                continue
-        if n_negative >= 0:
-            if is_reversed:
-                for i in range(n // 2 + n % 2):
-                    for j in range(n if i < n // 2 else n // 2):
-                        k = i * width + j
-                        mirrored = (n - 1 - i) * width + n - 1 - j
-                        inverse[k], inverse[mirrored] = inverse[mirrored], inverse[k]
-            return n_negative
-    return -1
+    load(inverse, scratch.front, n, front_width, width)
+    n_negative = invert(inverse, n, width, scratch.rows, scratch.columns)
+    if n_negative > 0:
+        load(scratch.pivot_copy, scratch.front, n, front_width, width)
+        residual = residual_norm(scratch.pivot_copy, inverse, n, width, scratch.residual)
+        if not residual <= MAX_RESIDUAL:
+            return -1
+    return n_negative
