@@ -571,7 +571,7 @@ def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path):
         assert_allclose(found, -1.0, atol=1e-6)
     write_body(tmp_path / "egg.off", 1, 1)
     with pytest.raises(
-        MeshError, match=r"egg\.off: expected a PDB, mmCIF or PQR file for 'charge'"
+        MeshError, match=r"egg\.off: expected a PDB, mmCIF, BinaryCIF or PQR file for 'charge'"
     ):
         charge(BodyRef(tmp_path / "egg.off"), points)
     with pytest.raises(ValueError, match=r"attribute: expected one of charge, .*, got 'mood'"):

@@ -595,11 +595,6 @@ def test_lipids_among_the_atoms_of_polymers_are_told(tmp_path):
     assert any("1 residues" in note and "lipids or detergents" in note for note in molecule.notes)
 
 
-def test_binary_cif_is_refused_with_the_remedy(tmp_path):
-    with pytest.raises(MeshError, match=r"BinaryCIF is not read. Download .* as mmCIF"):
-        load_mesh(written(tmp_path, "x", "entry.bcif"))
-
-
 def test_the_first_model_alone_is_read_if_asked_for(tmp_path):
     models = [f"MODEL        {k}\n{residue(1)}{residue(2, chain='B')}ENDMDL\n" for k in (3, 4)]
     path = written(tmp_path, "".join(models))

@@ -12,6 +12,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from igps.fields.molecules._binary_cif import MAX_BYTES as MAX_BINARY_BYTES
+from igps.fields.molecules._binary_cif import read_binary_cif
 from igps.mesh.errors import MeshError
 from igps.mesh.raw_body import distinct
 
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-SUFFIXES = frozenset({".pdb", ".ent", ".cif", ".mmcif", ".pqr"})
+SUFFIXES = frozenset({".pdb", ".ent", ".cif", ".mmcif", ".bcif", ".pqr"})
 """Suffixes of structure files; ".gz" may follow."""
 
 _MAX_BYTES = 2**31  # twice the largest structures of the Protein Data Bank
@@ -56,16 +58,20 @@ def read_structures(path: Path) -> dict[str, gemmi.Structure]:
 
     The atoms of a PQR file carry their charges as occupancies and their radii as B-factors.
     """
-    text = _read_text(path)
-    if suffix_of(path) == ".pqr":
-        return {"": _pqr(text, path)}
+    content = _read_bytes(path)
+    suffix = suffix_of(path)
+    if suffix == ".pqr":
+        return {"": _pqr(content, path)}
     gemmi = gemmi_module()
     try:
-        if suffix_of(path) in (".pdb", ".ent"):
-            _check_end(text, path)
-            marked = _ATOM_LINE.sub(_mark_missing, _WIDE.sub(_narrowed, text))
+        if suffix in (".pdb", ".ent"):
+            _check_end(content, path)
+            marked = _ATOM_LINE.sub(_mark_missing, _WIDE.sub(_narrowed, content))
             return {"": _pdb(_numbered_models(_frames_as_models(marked)))}
-        document = gemmi.cif.read_string(text.decode("utf-8", "replace"))
+        if suffix == ".bcif":
+            document = _binary_document(content)
+        else:
+            document = gemmi.cif.read_string(content.decode("utf-8", "replace"))
         blocks = [block for block in document if block.find_values("_atom_site.id")] or [
             document[0]
         ]
@@ -132,31 +138,38 @@ def gemmi_module() -> Any:
     return gemmi
 
 
-def _read_text(path: Path) -> bytes:
-    if suffix_of(path) == ".bcif":
-        raise MeshError(
-            f"{path}: BinaryCIF is not read. Download the same entry as mmCIF (.cif), or convert it, as with ChimeraX."
-        )
+def _binary_document(content: bytes) -> gemmi.cif.Document:
+    document = gemmi_module().cif.Document()
+    for name, tables in read_binary_cif(content):
+        block = document.add_new_block(name)
+        for title, columns in tables.items():
+            block.set_mmcif_category(title, columns)
+    return document
+
+
+def _read_bytes(path: Path) -> bytes:
     if suffix_of(path) not in SUFFIXES:
         raise MeshError(
             f"{path}: expected a structure in {', '.join(sorted(SUFFIXES))}, gzipped or not."
         )
     if not path.is_file():
         raise MeshError(f"{path}: no such file. Check the path.")
+    is_binary = suffix_of(path) == ".bcif"
+    max_bytes = MAX_BINARY_BYTES if is_binary else _MAX_BYTES
     try:
         with gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb") as file:
-            text = file.read(_MAX_BYTES + 1)
+            content = file.read(max_bytes + 1)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise MeshError(
             f"{path}: the gzipped file is cut short or damaged ({error}). Download it again."
         ) from error
-    if len(text) > _MAX_BYTES:
-        raise MeshError(
-            f"{path}: expected at most {_MAX_BYTES:,} bytes of text, got more. Check the file."
-        )
-    if not text.strip():
+    if len(content) > max_bytes:
+        raise MeshError(f"{path}: expected at most {max_bytes:,} bytes, got more. Check the file.")
+    if not content.strip():
         raise MeshError(f"{path}: the file is empty. Export it again.")
-    return text.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if is_binary:
+        return content
+    return content.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
 
 
 def _pdb(text: bytes) -> gemmi.Structure:

@@ -183,7 +183,5 @@ def _surface(molecules: Mapping[str, Molecule], part: str) -> Mesh:
     return surface
 
 
-_SUFFIXES = tuple(
-    sorted(suffix + ending for suffix in (*SUFFIXES, ".bcif") for ending in ("", ".gz"))
-)
+_SUFFIXES = tuple(sorted(suffix + ending for suffix in SUFFIXES for ending in ("", ".gz")))
 FORMAT = Format("a structure", _SUFFIXES, read, ("chains", "models", "assembly"), extra="molecules")

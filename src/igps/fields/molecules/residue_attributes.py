@@ -192,7 +192,7 @@ class ResidueAttribute:
         """Return values (P,) or (P, C) at points (P, 3), Å; raise a MeshError if the body has no such values."""
         if not is_structure(body.path):
             raise MeshError(
-                f"{body}: expected a PDB, mmCIF or PQR file for {self.name!r}. Choose another descriptor."
+                f"{body}: expected a PDB, mmCIF, BinaryCIF or PQR file for {self.name!r}. Choose another descriptor."
             )
         values = residue_attribute(molecule_of(body), points, self.name)
         if np.isnan(values).all():

@@ -63,7 +63,7 @@ _NOTES = {
 
 
 def is_structure(path: str | Path) -> bool:
-    """Return whether a file has a suffix of PDB, mmCIF or PQR, gzipped or not."""
+    """Return whether a file has a suffix of PDB, mmCIF, BinaryCIF or PQR, gzipped or not."""
     return suffix_of(Path(path)) in SUFFIXES
 
 
@@ -74,7 +74,7 @@ def read_molecule(
     ligands: bool = False,
     hydrogens: bool = False,
 ) -> list[Molecule]:
-    """Read the bodies of a structure file: PDB, mmCIF or PQR, gzipped or not.
+    """Read the bodies of a structure file: PDB, mmCIF, BinaryCIF or PQR, gzipped or not.
 
     Each model of an ensemble, and each data block of mmCIF with atoms, yields separate bodies. Water is left out. The
     alternative location with the highest occupancy is used, the first one of a tie. Radii are van der Waals radii of
