@@ -16,6 +16,7 @@ point y, and h the distance from x to the tangent plane at y. Far away the kerne
 """
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 from typing import Self
 
 import numpy as np
@@ -37,6 +38,22 @@ from igps.signature.ordering import principal_axes, spatial_order
 _LEAF_SIZE = 32  # hats in the smallest clusters; a cluster costs as much as 19 hats
 _N_TERMS = 19
 _HALF_DIAGONAL = 1 - np.eye(3) / 2  # halves the diagonal of a matrix plus its transpose
+# The products of coordinates in quadratic and cubic forms
+_PAIRS = list(combinations_with_replacement(range(3), 2))
+_TRIPLES = list(combinations_with_replacement(range(3), 3))
+_SQUARES = np.array([float(i == j) for i, j in _PAIRS])  # coefficients of |e|²
+# (6, 3, 3) matrix of each product of two coordinates
+_MATRICES = np.array(
+    [(np.outer(a, b) + np.outer(b, a)) / 2 for a, b in np.eye(3)[np.array(_PAIRS)]]
+)
+# (18, 10) to which product of three coordinates each product of one and two belongs
+_CUBES = np.array(
+    [
+        [float(sorted((i, *pair)) == list(triple)) for triple in _TRIPLES]
+        for i in range(3)
+        for pair in _PAIRS
+    ]
+)
 
 
 class HatSurface:
@@ -212,9 +229,8 @@ class HatClusters:
         sums = np.empty((level_starts[-1], _N_TERMS, functions.shape[1]), functions.dtype)
 
         def fill(level: int) -> None:
-            terms = np.empty((n_hats, _N_TERMS), functions.dtype)
             size = sizes[level]
-            _fill_cluster_terms(hats, size, centres[level], radii[level], terms)
+            terms = _cluster_terms(hats, size, centres[level], radii[level]).astype(functions.dtype)
             starts = range(0, n_hats, size)
             for cluster, start in enumerate(starts, start=level_starts[level]):
                 part = slice(start, start + size)
@@ -234,79 +250,40 @@ class HatClusters:
         return clusters[:n_clusters], hats[:n_hats]
 
 
-def _fill_cluster_terms(
-    hats: Floats, size: int, centres: Floats, radii: Floats, terms: NDArray[np.floating]
-) -> None:
-    """Fill the contribution (V, 19) of each hat to the sums of its cluster, which consists of `size` consecutive hats.
+def _cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats) -> Floats:
+    """Return the contribution (V, 19) of each hat to the sums of its cluster, which consists of `size` hats in a row.
 
     The moments of n dS about the cluster's centre are F = ∫ λ n, T + F sᵀ, and 2 T s + F E, where T is the symmetric
     part of ∫ λ n (y − p)ᵀ, E the second moment of y under λ, and s the vector from the cluster's centre to the hat's.
     They are contracted with the derivatives of u, which are |e|² times e, −4 e eᵀ + |e|², and 24 e e e − 4 |e|² e in
-    each of three ways.
+    each of three ways: the cubic form is 12 (F·e) eᵀEe + 24 (s·e) eᵀTe − 2 (g·e) |e|².
     """
     cluster = np.arange(len(hats)) // size
-    scale = 1 / radii[cluster]
-    p = hats.T
-    s0, s1, s2 = scale * (p[:3] - centres[cluster].T)
-    out = terms.T
-    cubed = scale * scale * scale
-    squared = scale * scale
-    f0 = cubed * p[5]
-    f1 = cubed * p[6]
-    f2 = cubed * p[7]
-    # S is −4 dᵀTd, and B is 12 dᵀCd; entries off the diagonal count twice.
-    tilt = -squared * squared / 4
-    spread = squared / 12
-    t00 = tilt * p[12]
-    t01 = tilt * p[13]
-    t02 = tilt * p[14]
-    t11 = tilt * p[15]
-    t12 = tilt * p[16]
-    t22 = tilt * p[17]
-    e00 = spread * p[18] + s0 * s0
-    e11 = spread * p[21] + s1 * s1
-    e22 = spread * p[23] + s2 * s2
-    e01 = spread * p[19] + 2 * s0 * s1
-    e02 = spread * p[20] + 2 * s0 * s2
-    e12 = spread * p[22] + 2 * s1 * s2
-    out[0] = f0
-    out[1] = f1
-    out[2] = f2
-    n00 = t00 + f0 * s0
-    n11 = t11 + f1 * s1
-    n22 = t22 + f2 * s2
-    trace = n00 + n11 + n22
-    out[3] = trace - 4 * n00
-    out[6] = trace - 4 * n11
-    out[8] = trace - 4 * n22
-    out[4] = -4 * (t01 + f0 * s1 + f1 * s0)
-    out[5] = -4 * (t02 + f0 * s2 + f2 * s0)
-    out[7] = -4 * (t12 + f1 * s2 + f2 * s1)
-    trace_t = t00 + t11 + t22
-    trace_e = e00 + e11 + e22
-    g0 = 2 * trace_t * s0 + trace_e * f0 + 2 * (2 * t00 * s0 + t01 * s1 + t02 * s2)
-    g1 = 2 * trace_t * s1 + trace_e * f1 + 2 * (t01 * s0 + 2 * t11 * s1 + t12 * s2)
-    g2 = 2 * trace_t * s2 + trace_e * f2 + 2 * (t02 * s0 + t12 * s1 + 2 * t22 * s2)
-    g0 += 2 * e00 * f0 + e01 * f1 + e02 * f2
-    g1 += e01 * f0 + 2 * e11 * f1 + e12 * f2
-    g2 += e02 * f0 + e12 * f1 + 2 * e22 * f2
-    # 12 (F·e) eᵀEe + 24 (s·e) eᵀTe − 2 (g·e) |e|²
-    f0 = 12 * f0
-    f1 = 12 * f1
-    f2 = 12 * f2
-    s0 = 24 * s0
-    s1 = 24 * s1
-    s2 = 24 * s2
-    g0 = 2 * g0
-    g1 = 2 * g1
-    g2 = 2 * g2
-    out[9] = f0 * e00 + s0 * t00 - g0
-    out[10] = f0 * e01 + f1 * e00 + s0 * t01 + s1 * t00 - g1
-    out[11] = f0 * e02 + f2 * e00 + s0 * t02 + s2 * t00 - g2
-    out[12] = f0 * e11 + f1 * e01 + s0 * t11 + s1 * t01 - g0
-    out[13] = f0 * e12 + f1 * e02 + f2 * e01 + s0 * t12 + s1 * t02 + s2 * t01
-    out[14] = f0 * e22 + f2 * e02 + s0 * t22 + s2 * t02 - g0
-    out[15] = f1 * e11 + s1 * t11 - g1
-    out[16] = f1 * e12 + f2 * e11 + s1 * t12 + s2 * t11 - g2
-    out[17] = f1 * e22 + f2 * e12 + s1 * t22 + s2 * t12 - g1
-    out[18] = f2 * e22 + s2 * t22 - g2
+    scale = 1 / radii[cluster, None]
+    s = scale * (hats[:, :3] - centres[cluster])
+    flux = scale**3 * hats[:, 5:8]
+    # The coefficients of forms; S is −4 dᵀTd, and B is 12 dᵀCd
+    tilt = -(scale**4) / 4 * hats[:, 12:18]
+    spread = scale**2 / 12 * hats[:, 18:24] + _entries(_outer(s, s))
+    first = tilt + _entries(_outer(flux, s))
+    second = _trace(first) * _SQUARES - 4 * first
+    g = 2 * _trace(tilt) * s + _trace(spread) * flux
+    g += 4 * _times(tilt, s) + 2 * _times(spread, flux)
+    third = 12 * _cubic(flux, spread) + 24 * _cubic(s, tilt) - 2 * _cubic(g, _SQUARES[None])
+    return np.concatenate([flux, second, third], axis=1)
+
+
+def _trace(entries: Floats) -> Floats:
+    """Return the traces (n, 1) of quadratic forms, by their coefficients (n, 6)."""
+    return (entries @ _SQUARES)[:, None]
+
+
+def _times(entries: Floats, vectors: Floats) -> Floats:
+    """Return the products (n, 3) of the matrices of quadratic forms, by their coefficients (n, 6), with vectors."""
+    return np.einsum("ne,eij,nj->ni", entries, _MATRICES, vectors)
+
+
+def _cubic(vectors: Floats, entries: Floats) -> Floats:
+    """Return the coefficients (n, 10) of products of linear forms (n, 3) and quadratic ones (n, 6)."""
+    products = _outer(vectors, entries)
+    return products.reshape(len(products), -1) @ _CUBES

@@ -58,55 +58,23 @@ def _tile(n_columns: int) -> Any:
     vector = ir.VectorType(real, n_columns) if n_columns > 1 else real
     fused = ("contract",)
 
-    def tile(  # noqa: PLR0913 (the operands of a hand-made tile)
-        context: Any,
-        a: Any,
-        a_at: Any,
-        a_step: Any,
-        a_stride: Any,
-        x: Any,
-        x_at: Any,
-        x_step: Any,
-        add: Any,
-        source: Any,
-        source_at: Any,
-        source_step: Any,
-        out: Any,
-        out_at: Any,
-        out_step: Any,
-        n_rows: Any,
-        n_terms: Any,
-        scale: Any,
+    def tile(
+        context: Any, a: Any, x: Any, add: Any, source: Any, out: Any, size: Any, scale: Any
     ) -> Any:
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            names = (
-                "a",
-                "a_at",
-                "a_step",
-                "a_stride",
-                "x",
-                "x_at",
-                "x_step",
-                "add",
-                "source",
-                "source_at",
-                "source_step",
-                "out",
-                "out_at",
-                "out_step",
-                "n_rows",
-                "n_terms",
-                "scale",
+            operands = []
+            for numba_type, value in zip(signature.args, values, strict=True):
+                items = [value]
+                if isinstance(numba_type, types.BaseTuple):
+                    items = cgutils.unpack_tuple(builder, value)
+                if isinstance(numba_type, types.BaseTuple) and numba_type is not size:
+                    array = context.make_array(numba_type[0])(context, builder, items[0])
+                    items[0] = builder.gep(array.data, [items[1]])
+                operands.append(items)
+            (a_start, _, a_step, a_stride), x_rows, [is_added], source_rows, out_rows, *rest = (
+                operands
             )
-            arguments = dict(zip(names, values, strict=True))
-            for numba_type, name in zip(signature.args, names, strict=True):
-                if isinstance(numba_type, types.Array):
-                    arguments[name] = context.make_array(numba_type)(
-                        context, builder, arguments[name]
-                    ).data
-
-            def pointer(name: str, offset: Any) -> Any:
-                return builder.gep(arguments[name], [builder.add(arguments[name + "_at"], offset)])
+            (n_rows, n_terms), [factor] = rest
 
             def broadcast(value: Any) -> Any:
                 """Fill a vector with a number."""
@@ -119,60 +87,39 @@ def _tile(n_columns: int) -> Any:
                     first, first, ir.Constant(ir.VectorType(ir.IntType(32), n_columns), None)
                 )
 
-            def row(name: str, index: Any) -> Any:
-                start = pointer(name, builder.mul(index, arguments[name + "_step"]))
-                return builder.bitcast(start, vector.as_pointer())
+            def row(operand: Any, index: Any) -> Any:
+                start, _, step = operand
+                place = builder.gep(start, [builder.mul(index, step)])
+                return builder.bitcast(place, vector.as_pointer())
 
-            last = builder.sub(arguments["n_rows"], integer(1))
+            last = builder.sub(n_rows, integer(1))
             rows = [
                 builder.select(builder.icmp_signed("<", integer(i), last), integer(i), last)
                 for i in range(ROWS)
             ]
-            columns_of_a = [pointer("a", builder.mul(i, arguments["a_stride"])) for i in rows]
+            columns_of_a = [builder.gep(a_start, [builder.mul(i, a_stride)]) for i in rows]
             sums = [cgutils.alloca_once_value(builder, ir.Constant(vector, None)) for _ in rows]
-            with cgutils.for_range(builder, arguments["n_terms"]) as loop:
-                x_row = builder.load(row("x", loop.index), align=8)
-                offset = builder.mul(loop.index, arguments["a_step"])
+            with cgutils.for_range(builder, n_terms) as loop:
+                x_row = builder.load(row(x_rows, loop.index), align=8)
+                offset = builder.mul(loop.index, a_step)
                 for column, total in zip(columns_of_a, sums, strict=True):
-                    term = builder.fmul(
-                        broadcast(builder.load(builder.gep(column, [offset]))), x_row, flags=fused
-                    )
+                    number = broadcast(builder.load(builder.gep(column, [offset])))
+                    term = builder.fmul(number, x_row, flags=fused)
                     builder.store(builder.fadd(builder.load(total), term, flags=fused), total)
-            scale = broadcast(arguments["scale"])
-            products = [builder.fmul(builder.load(total), scale, flags=fused) for total in sums]
-            with builder.if_else(arguments["add"]) as (added, alone):
+            factors = broadcast(factor)
+            products = [builder.fmul(builder.load(total), factors, flags=fused) for total in sums]
+            with builder.if_else(is_added) as (added, alone):
                 with added:
-                    source_rows = [builder.load(row("source", i), align=8) for i in rows]
-                    for i, source_row, result in zip(rows, source_rows, products, strict=True):
-                        builder.store(
-                            builder.fadd(source_row, result, flags=fused), row("out", i), align=8
-                        )
+                    addends = [builder.load(row(source_rows, i), align=8) for i in rows]
+                    for i, addend, result in zip(rows, addends, products, strict=True):
+                        total = builder.fadd(addend, result, flags=fused)
+                        builder.store(total, row(out_rows, i), align=8)
                 with alone:
                     for i, result in zip(rows, products, strict=True):
-                        builder.store(result, row("out", i), align=8)
+                        builder.store(result, row(out_rows, i), align=8)
             return context.get_dummy_value()
 
-        i64 = types.int64
-        argument_types = (
-            a,
-            i64,
-            i64,
-            i64,
-            x,
-            i64,
-            i64,
-            types.boolean,
-            source,
-            i64,
-            i64,
-            out,
-            i64,
-            i64,
-            i64,
-            i64,
-            types.float64,
-        )
-        return types.void(*argument_types), generate
+        return types.void(a, x, types.boolean, source, out, size, types.float64), generate
 
     return intrinsic(tile)
 
@@ -200,46 +147,17 @@ def product(
     m, n, k = shape
     is_added = add != 0
     for i in range(0, m, ROWS):
-        n_rows = min(ROWS, m - i)
+        size = (min(ROWS, m - i), k)
+        columns = (a[0], a[1] + i * a[3], a[2], a[3])
         if n < COLUMNS:
             for j in range(n):
-                narrow_tile(
-                    a[0],
-                    a[1] + i * a[3],
-                    a[2],
-                    a[3],
-                    x[0],
-                    x[1] + j,
-                    x[2],
-                    is_added,
-                    source[0],
-                    source[1] + i * source[2] + j,
-                    source[2],
-                    out[0],
-                    out[1] + i * out[2] + j,
-                    out[2],
-                    n_rows,
-                    k,
-                    scale,
-                )
+                source_rows = (source[0], source[1] + i * source[2] + j, source[2])
+                out_rows = (out[0], out[1] + i * out[2] + j, out[2])
+                x_rows = (x[0], x[1] + j, x[2])
+                narrow_tile(columns, x_rows, is_added, source_rows, out_rows, size, scale)
         for begin in range(0, n if n >= COLUMNS else 0, COLUMNS):
             j = min(begin, n - COLUMNS)
-            tile(
-                a[0],
-                a[1] + i * a[3],
-                a[2],
-                a[3],
-                x[0],
-                x[1] + j,
-                x[2],
-                is_added,
-                source[0],
-                source[1] + i * source[2] + j,
-                source[2],
-                out[0],
-                out[1] + i * out[2] + j,
-                out[2],
-                n_rows,
-                k,
-                scale,
-            )
+            source_rows = (source[0], source[1] + i * source[2] + j, source[2])
+            out_rows = (out[0], out[1] + i * out[2] + j, out[2])
+            x_rows = (x[0], x[1] + j, x[2])
+            tile(columns, x_rows, is_added, source_rows, out_rows, size, scale)

@@ -193,43 +193,6 @@ def locate(values: Numbers, axes: Axes, k: Any, start: int, result: Row) -> None
         cell[j] = cell[j] * width + interval[j]
 
 
-# Scales of shares and of the number of pairs, which are packed in one integer. The shares of 2¹⁸ pairs, the maximum of
-# a block, do not overflow into the number. Shares in single precision lose no digit, except in the first interval.
-_SHARE_SCALE = 2**24
-_PAIR_SCALE = 2**44
-# Copies of each cell. Consecutive pairs often fall into the same cell, but into different copies, so that no addition
-# waits for the previous one.
-LANES = 4
-
-
-@compiled()
-def pack_pairs(cell: Indices, home: Indices, share: Numbers, integer_shares: Indices) -> None:
-    """Replace the cells of pairs (n,) by indices of `add_whole_pairs`, and fill in their shares (n,) as integers."""
-    for j in range(len(cell)):
-        cell[j] = (cell[j] + home[j]) * np.int32(LANES) + np.int32(j % LANES)
-        integer_shares[j] = np.int32(share[j] * share.dtype.type(_SHARE_SCALE))
-
-
-@compiled()
-def add_whole_pairs(cell: Indices, integer_shares: Indices, packed: Integers) -> None:
-    """`add_one_axis` for weights of 1, to integers (cells·LANES,): one store for both corners, without rounding."""
-    for j in range(len(cell)):
-        packed[np.uint32(cell[j])] += _PAIR_SCALE + np.int64(integer_shares[j])
-
-
-@compiled()
-def unpack(packed: Integers, sums: Floats) -> None:
-    """Write the packed counts to the sums (cells, 2), and clear them."""
-    for c in range(len(packed) // LANES):
-        packed_sum = 0
-        for lane in range(LANES * c, LANES * (c + 1)):
-            packed_sum += packed[lane]
-            packed[lane] = 0
-        upper = (packed_sum % _PAIR_SCALE) / _SHARE_SCALE
-        sums[c, 0] = packed_sum // _PAIR_SCALE - upper
-        sums[c, 1] = upper
-
-
 @compiled(fastmath=FUSE)
 def add_one_axis(
     cell: Indices, home: Indices, share: Numbers, weights: Floats, sums: Floats
@@ -370,13 +333,10 @@ class Sums(NamedTuple):
     cells: Floats  # (C·cells, 2^K)
     by_class: Floats  # (C, cells·2^K) the same memory
     home: Indices  # (M, J) first cell of the class of each column's point
-    packed: Integers  # (C·cells·LANES,) if M and all weights are 1 on one axis in single precision, otherwise empty
     part: Floats  # (J,)
 
 
-def new_sums(
-    members: Members, column: int, n_columns: int, shape: tuple[int, int, int], packs: bool
-) -> Sums:
+def new_sums(members: Members, column: int, n_columns: int, shape: tuple[int, int, int]) -> Sums:
     """Return empty sums for n columns of a block, of a shape (C, cells, 2^K)."""
     n_classes, n_cells, n_corners = shape
     cells = np.zeros((n_classes * n_cells, n_corners))
@@ -384,7 +344,6 @@ def new_sums(
         cells,
         cells.reshape(n_classes, -1),
         (members[0][:, column : column + n_columns] * n_cells).astype(np.int32),
-        np.zeros(len(cells) * LANES * packs, np.int64),
         np.empty(n_columns),
     )
 
@@ -416,7 +375,6 @@ def count_block(
     n_members = len(classes)
     n_corners = 1 << n_axes
     n_cells = total.shape[1] // n_corners
-    packs = len(sums.packed) > 0
     home = sums.home
     # Range of cells with counts. With one class for each point, it is all cells: many rows are then flushed together,
     # and adding empty cells takes less time than tracking the range.
@@ -434,7 +392,6 @@ def count_block(
                     and weights[m, point] == weights[m, point - 1]
                 )
             if not is_same:
-                unpack(sums.packed, sums.cells)
                 begin = lowest * n_corners
                 flush(sums.by_class, begin, (highest + 1) * n_corners, members, point - 1, total)
                 lowest, highest = empty_range
@@ -448,21 +405,12 @@ def count_block(
         for m in range(n_members):
             home_m = home[m, first:]
             weight = weights[m, column + first :]
-            if packs:
-                pack_pairs(
-                    result.cells[start:],
-                    home[0, start:],
-                    shares[0, start:],
-                    result.interval[start:],
-                )
-                add_whole_pairs(cell, result.interval[first:], sums.packed)
-            elif n_axes == 1:
+            if n_axes == 1:
                 add_one_axis(cell, home_m, shares[0, first:], weight, sums.cells)
             elif n_axes == 4:
                 add_four_axes(cell, home_m, shares, first, weight, sums.cells)
             else:
                 add_axes(cell, home_m, shares, first, weight, sums.part[first:], sums.cells)
-    unpack(sums.packed, sums.cells)
     last = row + values.shape[1] - 1
     flush(sums.by_class, lowest * n_corners, (highest + 1) * n_corners, members, last, total)
 

@@ -35,8 +35,7 @@ from igps.nn._kernels.pairs_by_torch import (
 )
 from igps.nn._precision import full_precision
 
-# Maximum numbers of values and of columns in a block, which then stays in a core's second-level cache. A larger block
-# could overflow the integers of `add_whole_pairs`.
+# Maximum numbers of values and of columns in a block, which then stays in a core's second-level cache.
 _BLOCK_SIZE = 2**18
 _MAX_COLUMNS = 2048
 _STRIP_ROWS = 128  # rows of a block whose inner products are computed by one matrix product
@@ -160,7 +159,6 @@ class _Shapes:
         kinds = [kind for pair in layout.pairs for kind in pair.kinds]
         self.n_values = sum(kind != COSINES for kind in kinds)
         self.n_oriented = kinds.count(COSINES)
-        self.can_pack = kinds in ([VALUES], [DISTANCES]) and self.dtype == torch.float32
         padded = pad_sequence(centres, batch_first=True).numpy()
         empty = np.empty(0)  # in place of the norms and vectors of each shape
         gaps = _inverse_gaps(padded, self.bins)
@@ -191,7 +189,6 @@ class _Shape:
         members = shapes.members_to_count if upstream is None else shapes.members
         classes, weights = (np.ascontiguousarray(x[number, :, :n_points]) for x in members)
         self.members = classes, weights
-        self.packs = shapes.can_pack and len(classes) == 1 and bool((weights == 1).all())
         own = [
             t.detach()[number].index_select(0, self.order) if t.ndim > 1 else t.detach()
             for t in tensors
@@ -254,7 +251,7 @@ class _Shape:
             values = self._view(buffer, row, column)
             self._write_values(values, row, column)
             n_columns = values.shape[2]
-            sums = new_sums(self.members, column, n_columns, self.shapes.sums_shape, self.packs)
+            sums = new_sums(self.members, column, n_columns, self.shapes.sums_shape)
             result = new_row(self.axes, n_columns)
             place = (row, column)
             count_block(values.numpy(), self.axes, place, self.members, total.numpy(), sums, result)
