@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 import igps
-from igps.nn.descriptor import Descriptor
+from igps.data.requirements import AnyDescriptor
 from training.shapes import GradedShapes
 
 
 def generated(
     shapes: GradedShapes,
     root: Path,
-    descriptor: Descriptor,
+    descriptor: AnyDescriptor,
     cache_dir: Path | None = None,
     n_workers: int | None = None,
 ) -> igps.SignatureDataset:

@@ -1,10 +1,10 @@
-"""Does a learned layout help on classes that it was not trained on? A program to try it.
+"""Does a learned layout help on classes that it was not trained on? The program behind the page.
 
-    python -m docs.benchmarks.layout FOLDER
+    python -m docs.benchmarks.layout FOLDER [--picture docs/pictures/learned.png]
 
-Generated bodies of ten classes are written to the folder. The layout is trained on five of them, in a plain loop of
-PyTorch, and the bodies of the other five query each other. The head is fitted to the training classes with the fixed
-and with the learned layout.
+Generated bodies of ten families are written to the folder. In each of five splits, the layout of `interior` is trained
+on five families, in a plain loop of PyTorch, and the bodies of the other five query each other. A head is fitted to the
+training families with the fixed and with the learned layout.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ from statistics import mean, stdev
 
 import torch
 from jsonargparse import auto_cli
+from matplotlib.figure import Figure
 from torch import Tensor
+from training.generated import generated
+from training.shapes import GradedShapes
 
 import igps
 from igps.cli import errors_as_messages
@@ -28,7 +31,17 @@ LEARNED: tuple[tuple[LayoutPart, ...], ...] = (
     ("filter",),
     ("bins", "classes", "filter"),
 )
+N_FAMILIES, N_BODIES, N_POSES = 10, 7, 2
 N_BATCH, N_SAMPLES = 20, 400
+
+
+def families(folder: Path, *descriptors: igps.Descriptor) -> igps.SignatureDataset:
+    """Return generated bodies of ten families, seven of each in two poses, with what the descriptors need."""
+    shapes = GradedShapes(N_FAMILIES, N_BODIES, N_POSES, seed=7, n_vertices=(1500, 2000))
+    requirements = descriptors[0].requirements
+    for descriptor in descriptors[1:]:
+        requirements |= descriptor.requirements
+    return generated(shapes, folder / "shapes", requirements, folder / "cache", n_workers=1)
 
 
 def contrastive(descriptions: Tensor, labels: Tensor) -> Tensor:
@@ -42,10 +55,11 @@ def contrastive(descriptions: Tensor, labels: Tensor) -> Tensor:
 
 def train(
     dataset: igps.SignatureDataset, parts: tuple[LayoutPart, ...], seed: int, n_steps: int
-) -> igps.Descriptor:
+) -> igps.HistogramDescriptor:
     """Train parts of the layout of `interior` on all classes of a dataset."""
     torch.manual_seed(seed)
     descriptor = igps.descriptor("interior", learnable=parts, n_training_samples=N_SAMPLES).train()
+    assert isinstance(descriptor, igps.HistogramDescriptor)
     optimizer = torch.optim.Adam(descriptor.parameters(), lr=0.03)
     for _ in range(n_steps):
         batch = dataset.batch(torch.randperm(len(dataset))[:N_BATCH].tolist())
@@ -58,42 +72,75 @@ def train(
 
 def scores(
     descriptor: igps.Descriptor, train_set: igps.SignatureDataset, test_set: igps.SignatureDataset
-) -> tuple[float, float]:
+) -> list[float]:
     """Return FT in percent on the test classes, without a head and with one for the training classes."""
     train_histograms = igps.describe(train_set, descriptor).flatten(1)
     test_histograms = igps.describe(test_set, descriptor).flatten(1)
     head = WhitenedHead().fit(train_histograms, train_set.labels)
     vectors = head(test_histograms)
-    labels = test_set.labels.tolist()
     plain = descriptor.distances(test_histograms, test_histograms)
-    learned = head.distances(vectors, vectors)
-    return tuple(100 * igps.retrieval_scores(x, labels).mean()["ft"] for x in (plain, learned))  # type: ignore[return-value]
+    whitened = head.distances(vectors, vectors)
+    return [first_tier(plain, test_set), first_tier(whitened, test_set)]
 
 
-def main(folder: Path, seeds: tuple[int, ...] = SEEDS, n_steps: int = 40) -> None:
+def first_tier(distances: Tensor, dataset: igps.SignatureDataset) -> float:
+    """Return the mean FT in percent of all bodies of a dataset, from their distances."""
+    return 100 * igps.retrieval_scores(distances, dataset.labels.tolist()).mean()["ft"]
+
+
+def draw(before: igps.HistogramDescriptor, after: igps.HistogramDescriptor, path: Path) -> None:
+    """Draw the centres of the classes and of the bins of `interior` before and after training."""
+    figure = Figure(figsize=(7, 2.6), layout="constrained")
+    panels = figure.subplots(2, 1)
+    for panel, number, name in zip(panels, (0, 1), ("potential", "interior distance"), strict=True):
+        for height, descriptor in ((1, before), (0, after)):
+            centres = descriptor.histograms[0].axes[number].centres().detach()
+            panel.vlines(centres, height, height + 0.8, "C1" if height == 0 else "C0")
+        panel.set(title=name, yticks=(0.4, 1.4), yticklabels=("learned", "fixed"))
+        panel.title.set_fontsize(9)
+    figure.savefig(path, dpi=100)
+
+
+def main(
+    folder: Path, seeds: tuple[int, ...] = SEEDS, n_steps: int = 100, picture: Path | None = None
+) -> None:
     """Print FT of the fixed layout, and what learning adds: mean and standard deviation over splits."""
-    igps.ArticulatedShapes(n_classes=10, n_per_class=8, n_vertices=1000).write(folder / "shapes")
+    torch.set_num_threads(1)
     fixed = igps.descriptor("interior")
-    dataset = igps.SignatureDataset(folder / "shapes", descriptor=fixed, cache_dir=folder / "cache")
-    dataset.precompute(n_workers=1)
-    dataset = dataset.to_memory()
+    assert isinstance(fixed, igps.HistogramDescriptor)
+    dataset = families(folder, fixed).to_memory()
     labels = dataset.labels
-    gains: dict[tuple[LayoutPart, ...], list[tuple[float, float]]] = {p: [] for p in LEARNED}
+    numbers = igps.descriptor("measures")
+    starts = []
+    plain_numbers = []
+    gains: dict[tuple[LayoutPart, ...], list[list[float]]] = {parts: [] for parts in LEARNED}
     for seed in seeds:
-        order = torch.randperm(10, generator=torch.Generator().manual_seed(seed))
-        is_train = torch.isin(labels, order[:5])
+        order = torch.randperm(N_FAMILIES, generator=torch.Generator().manual_seed(seed))
+        is_train = torch.isin(labels, order[: N_FAMILIES // 2])
         train_set = dataset[is_train]
         test_set = dataset[~is_train]
         start = scores(fixed, train_set, test_set)
-        print(f"{seed} fixed: plain {start[0]:.1f}, whitened {start[1]:.1f}", flush=True)
+        starts.append(start)
+        rows = igps.describe(test_set, numbers)
+        plain_numbers.append([first_tier(numbers.distances(rows, rows), test_set)])
         for parts in LEARNED:
-            found = scores(train(train_set, parts, seed, n_steps), train_set, test_set)
-            gains[parts].append((found[0] - start[0], found[1] - start[1]))
-            print(f"{seed} {parts}: {found[0]:.1f}, {found[1]:.1f}", flush=True)
-    for parts, pairs in gains.items():
-        for name, gain in zip(("plain", "whitened"), zip(*pairs, strict=True), strict=True):
-            spread = stdev(gain) if len(gain) > 1 else 0.0
-            print(f"{' '.join(parts)}, {name}: {mean(gain):+.1f} ± {spread:.1f}")
+            learned = train(train_set, parts, seed, n_steps)
+            found = scores(learned, train_set, test_set)
+            gains[parts].append([b - a for a, b in zip(start, found, strict=True)])
+            print(seed, " ".join(parts), start, found, flush=True)
+            if picture is not None and parts == LEARNED[0] and seed == seeds[0]:
+                draw(fixed, learned, picture)
+    report("plain numbers", plain_numbers)
+    report("fixed", starts)
+    for parts in LEARNED:
+        report(" ".join(parts), gains[parts])
+
+
+def report(title: str, rows: list[list[float]]) -> None:
+    """Print mean and standard deviation over the splits, without a head and, if measured, with one."""
+    for name, column in zip(("no head", "whitened"), zip(*rows, strict=False), strict=False):
+        spread = stdev(column) if len(column) > 1 else 0.0
+        print(f"{title}, {name}: {mean(column):.1f} ± {spread:.1f}")
 
 
 if __name__ == "__main__":
