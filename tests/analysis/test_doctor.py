@@ -1,6 +1,7 @@
 """What `examine` says of files that were damaged by hand."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,19 +20,27 @@ from damaged_files import (
     write_unusable,
 )
 from igps.analysis.doctor import examine, expected_cost
+from igps.data.pipeline import SignaturePipeline
 from igps.data.sources import find_bodies
 from igps.failures import Limits
 from igps.fields.volumes.label_measures import VoxelMeasures, thinnest_part
+from igps.mesh.errors import MeshError
+from igps.mesh.loading import BodyRef, load_bodies
 from igps.mesh.options import LoadOptions
 from igps.report.tables import findings_table
-from igps.signature.signature import SignatureConfig
+from igps.signature.signature import SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 
 
-def findings(root, **options):
+def pipeline_of(root, reading=LoadOptions(), config=CONFIG):
+    return SignaturePipeline(config, reading, root.with_name(f"{root.name}-cache"))
+
+
+def findings(root, reading=LoadOptions(), limits=None):
     files = find_bodies(root)
-    found = examine(files, config=CONFIG, n_workers=1, progress=False, **options)
+    pipeline = pipeline_of(root, reading)
+    found = examine(files, pipeline, n_workers=1, progress=False, limits=limits)
     assert tuple(finding.id for finding in found) == files.names
     return {finding.id: finding for finding in found}
 
@@ -120,13 +129,39 @@ def test_the_cost_grows_with_vertices_and_eigenpairs():
 def test_the_cost_is_that_of_the_mesh_that_is_simplified(tmp_path):
     write_clean(tmp_path / "clean.off")
     files = find_bodies(tmp_path)
-    (full,) = examine(files, config=CONFIG, n_workers=1, progress=False)
+    (full,) = examine(files, pipeline_of(tmp_path), n_workers=1, progress=False)
     fewer = SignatureConfig(
         n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60, max_vertices=60
     )
-    (simplified,) = examine(files, config=fewer, n_workers=1, progress=False)
+    pipeline = pipeline_of(tmp_path, config=fewer)
+    (simplified,) = examine(files, pipeline, n_workers=1, progress=False)
     assert full.memory == expected_cost(N_VERTICES, 20)[1]
     assert simplified.memory == expected_cost(60, 20)[1]
+
+
+def test_what_was_examined_is_not_read_again(tmp_path, monkeypatch):
+    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+    labels = np.zeros((16, 14, 12), dtype=np.uint8)
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "empty.nii")
+    labels[2:12, 2:12, 2:7] = 1
+    labels[3:13, 3:11, 7:11] = 2
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "two.nii")
+    findings(tmp_path)
+    other = replace(CONFIG, resolution=8)
+    meshes = load_bodies(tmp_path / "two.nii")
+    pipeline = pipeline_of(tmp_path, config=other)
+    for name in ("each_surface", "read_surface"):
+        monkeypatch.delattr(f"igps.data.pipeline.{name}")
+    for part, mesh in zip("12", meshes, strict=True):
+        body = BodyRef(tmp_path / "two.nii", part, part)
+        found = pipeline.signature(body)
+        expected = compute_signature(mesh, other)
+        np.testing.assert_array_equal(found.interior.points, expected.interior.points)
+        assert found.measures == expected.measures
+        assert (found.notes, found.unit) == (expected.notes, expected.unit)
+        assert pipeline.mesh(body).frame == mesh.frame
+    with pytest.raises(MeshError, match="no voxel has a label"):
+        pipeline.signature(BodyRef(tmp_path / "empty.nii"))
 
 
 def test_labels_of_a_volume_are_told_one_by_one_by_their_voxels(tmp_path):

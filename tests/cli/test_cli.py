@@ -134,6 +134,23 @@ def test_some_bodies_ask_the_others(root, tmp_path, monkeypatch, capsys):
     assert "queries: expected a pattern that some bodies match, 0 of 6 match" in wrong
 
 
+def test_bodies_of_which_no_two_share_a_class_are_ranked_without_scores(
+    root, tmp_path, monkeypatch, capsys
+):
+    words = ["--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL]
+    out = tmp_path / "out"
+    run(monkeypatch, "retrieve", root, "--classes", "file", "--out", out, *words)
+    assert "no class has two bodies: rankings without scores" in capsys.readouterr().out
+    rows = list(csv.DictReader((out / "ranking.csv").open(newline="")))
+    assert [row["relevant"] for row in rows] == ["0"] * 6 * 5
+    assert set(json.loads((out / "scores.json").read_text())) == {
+        "n_given",
+        "n_used",
+        "n_refused",
+        "config",
+    }
+
+
 def test_results_are_written_though_nobody_reads_what_is_printed(root, tmp_path, monkeypatch):
     def gone(*words):
         raise BrokenPipeError

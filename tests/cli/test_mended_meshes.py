@@ -112,6 +112,8 @@ def test_never_and_always(root, tmp_path, monkeypatch, capsys):
             row["name"]: row["error"]
             for row in csv.DictReader((tmp_path / "out" / "failures.csv").open())
         }
+        for error in refused.values():
+            assert f"\n  {error}\n" in printed
         assert set(refused) == {
             "ball/soup.off",
             "egg/soup.off",

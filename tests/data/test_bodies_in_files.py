@@ -56,7 +56,7 @@ def root(tmp_path):
 def reads(monkeypatch):
     """Names of the files that are read for their bodies."""
     names = []
-    for name in ("each_body", "load_mesh"):
+    for name in ("each_surface", "read_surface"):
         function = getattr(pipeline_module, name)
 
         def reading(path, *arguments, function=function, **options):

@@ -195,6 +195,26 @@ def test_scores_and_confusions_need_classes(tmp_path, kind):
     assert ("worst" in ids) == (kind == "several")
 
 
+def test_classes_of_two_have_the_scores_of_a_single_answer(tmp_path):
+    labels = ("egg", "egg", "cup", "cup", "ant", "ant", "alone")
+    results = read_results(retrieval_folder(tmp_path, labels=labels))
+    seen = Elements(render_page(results, {}))
+    (system,) = seen.data()["systems"]
+    distances = distances_of(0)
+    ranks = []
+    for i in range(6):
+        order = sorted((j for j in range(7) if j != i), key=lambda j: (distances[i, j], j))
+        ranks.append(1 + order.index(i ^ 1))
+    assert system["per_query"]["rank"] == [*ranks, None]
+    assert system["scores"]["nn"] == pytest.approx(np.mean(np.equal(ranks, 1)), abs=1e-5)
+    assert system["scores"]["median_rank"] == np.sort(ranks)[2]
+    assert system["curve"] is system["per_class"] is None
+    titles = [attributes.get("title", "") for tag, attributes in seen.elements if tag == "abbr"]
+    assert any("among the nearest 5" in title for title in titles)
+    assert not any("E-measure" in title or "discounted" in title for title in titles)
+    assert not {"class-scores", "precision-recall"} & {a.get("id") for _, a in seen.elements}
+
+
 def test_a_comparison_has_all_descriptors(tmp_path):
     seen = Elements(render_page(read_results(comparison_folder(tmp_path / "compare")), {}))
     systems = seen.data()["systems"]

@@ -12,18 +12,17 @@ from igps._parallel import run
 from igps._progress import Progress
 from igps._text import counted
 from igps.data.filling import group_by_file
+from igps.data.pipeline import SignaturePipeline
 from igps.data.sources import Bodies, BodyRef
 from igps.failures import Failed, Limits
 from igps.fields.volumes.label_measures import VoxelMeasures, measure
 from igps.mesh._tidying import closed_by_rims, weld
-from igps.mesh.errors import MeshError
+from igps.mesh.errors import MeshError, NoBodyError
 from igps.mesh.loading import each_surface, surface_body
 from igps.mesh.mending import Step, repair_steps
 from igps.mesh.mesh import check_arrays
-from igps.mesh.options import LoadOptions
 from igps.mesh.raw_body import RawBody, UnitSource
 from igps.mesh.surface import face_parts
-from igps.signature.signature import SignatureConfig
 
 # Seconds and bytes of a signature on one core, by vertices and eigenpairs, as fitted by tests/benchmarks/cost.py to 62
 # signatures of 31 generated bodies with 770 to 119,000 vertices, with 50 and 250 eigenpairs. For bodies left out of the
@@ -75,19 +74,20 @@ class Finding:
 
 def examine(
     files: Bodies,
-    reading: LoadOptions | None = None,
-    config: SignatureConfig | None = None,
+    pipeline: SignaturePipeline,
     *,
     n_workers: int | None = None,
     limits: Limits | None = None,
     progress: bool = True,
 ) -> list[Finding]:
-    """Read and mend every body as for its signature, and return the findings in order; `limits` apply to each file."""
+    """Read and mend every body as for its signature, and return the findings in order; `limits` apply to each file.
+
+    The surfaces of labels, and reasons why bodies cannot be used, are kept in the cache of the pipeline.
+    """
     jobs = group_by_file(files, range(len(files)))
-    examine_file = partial(_examine_file, reading or LoadOptions(), config or SignatureConfig())
-    outcomes = run(
-        examine_file, [[files[i] for i in job] for job in jobs], n_workers=n_workers, limits=limits
-    )
+    bodies = [[files[i] for i in job] for job in jobs]
+    pipeline = replace(pipeline, needs_cache=False)
+    outcomes = run(partial(_examine_file, pipeline), bodies, n_workers=n_workers, limits=limits)
     findings: dict[int, Finding] = {}
     with (
         Progress(total=len(files), desc="bodies", disable=not progress) as bar,
@@ -110,18 +110,23 @@ def expected_cost(n_vertices: int, n_eigenpairs: int) -> tuple[float, float]:
     return seconds, _BYTES + _BYTES_PER_VERTEX * n_vertices + _BYTES_PER_ENTRY * entries
 
 
-def _examine_file(
-    reading: LoadOptions, config: SignatureConfig, bodies: Sequence[BodyRef]
-) -> list[Finding]:
+def _examine_file(pipeline: SignaturePipeline, bodies: Sequence[BodyRef]) -> list[Finding]:
     """Examine bodies of the same file, which is read once."""
     path = bodies[0].path
     findings: dict[BodyRef, Finding] = {}
+    by_part = {body.part: body for body in bodies}
     start = time.process_time()
     error = MeshError(f"{path}: the file has no such body. Choose a body of the file.")
     try:
-        for ref, raw in each_surface(path, reading, parts=[body.part for body in bodies]):
-            findings[ref] = _finding(ref, raw, reading, config, start)
+        content = pipeline.content(bodies[0])
+        for ref, raw in each_surface(path, pipeline.reading, parts=[*by_part]):
+            body = by_part[ref.part]
+            pipeline.keep_surface(body, content, raw)
+            findings[body] = _finding(ref, raw, pipeline, start)
             start = time.process_time()
+    except NoBodyError as nothing:  # only `each_surface` raises it
+        error = nothing
+        pipeline.remember(bodies[0], content, nothing)
     except MeshError as raised:
         error = raised
     unread = _refused(Finding(str(path)), error)
@@ -133,9 +138,9 @@ def _refused(finding: Finding, error: MeshError) -> Finding:
     return replace(finding, fault=fault, error=str(error), summary=error.summary)
 
 
-def _finding(
-    ref: BodyRef, raw: RawBody, reading: LoadOptions, config: SignatureConfig, start: float
-) -> Finding:
+def _finding(ref: BodyRef, raw: RawBody, pipeline: SignaturePipeline, start: float) -> Finding:
+    reading = pipeline.reading
+    config = pipeline.config
     voxels = None if raw.voxels is None else measure(raw.voxels())
     finding = Finding(str(ref), unit=raw.unit, unit_from=raw.unit_from, voxels=voxels)
     if raw.fault is not None:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from igps.cli.options import Verdict
+from igps.cli.options import Verdict, limits_of
 from igps.mesh.options import LoadOptions
 from igps.signature.config import SignatureConfig
 
@@ -36,9 +36,9 @@ def doctor(
         out: CSV file for the findings, with all notes.
     """
     from igps.analysis.doctor import examine
-    from igps.cli.reading import limits_of
     from igps.data.attribute_sources import attribute_sources
     from igps.data.cache import default_cache_dir
+    from igps.data.pipeline import SignaturePipeline
     from igps.data.sources import find_bodies
     from igps.report.tables import findings_table, write_rows
 
@@ -47,7 +47,8 @@ def doctor(
     attributes = attribute_sources(attribute or (), root)
     cache = cache_dir or default_cache_dir()
     bodies = find_bodies(root, reading, attributes=attributes.values(), cache_dir=cache)
-    findings = examine(bodies, reading, signature, n_workers=n_workers, limits=limits)
+    pipeline = SignaturePipeline(signature.resolved(), reading, cache)
+    findings = examine(bodies, pipeline, n_workers=n_workers, limits=limits)
     print(findings_table(findings))
     if out is not None:
         rows = [_row(finding) for finding in findings]

@@ -89,7 +89,7 @@ Vectors = tuple[str, list[int], Any]
 def inside_vectors(
     source: Folder, bodies: Bodies, members: Mapping[str, list[int]], **reading: Any
 ) -> tuple[list[Vectors], list[Vectors]]:
-    """Return what `igps groups` tests inside bodies; a body whose numbers are not defined is left out.
+    """Return what `igps groups` tests inside bodies, and print which bodies have no numbers and are left out.
 
     Args:
         source: where the bodies are read.
@@ -99,8 +99,12 @@ def inside_vectors(
     Returns:
         All numbers without a unit at once, as standard scores, for each kind; and each number by itself.
     """
-    dataset, table, _ = inside_bodies(source, **reading)
+    from igps.cli.reading import print_failures
+
+    dataset, table, failures = inside_bodies(source, **reading)
     row_of = {name: row for row, name in enumerate(dataset.bodies.names)}
+    # Those without a signature are told with the test of shape
+    print_failures([failure for failure in failures if failure.id in row_of], len(dataset))
     whole: list[Vectors] = []
     by_number: list[Vectors] = []
     for kind, indices in members.items():

@@ -5,6 +5,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
+from igps._parameters import check_positive
+from igps.failures import Limits
 from igps.mesh.options import LoadOptions
 from igps.signature.config import SignatureConfig
 
@@ -29,6 +31,13 @@ class Option:
     hint: Any  # type of its value
     help: str
     default: Any = None  # only for the help
+
+
+def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:
+    """Return the limits of one body; raise a ValueError that names the option if a number is not positive."""
+    limits = {"time_limit": seconds, "memory_limit": gigabytes}
+    check_positive(**{name: limit for name, limit in limits.items() if limit is not None})
+    return Limits(seconds, None if gigabytes is None else int(gigabytes * 1e9))
 
 
 _LOAD_HELP = {

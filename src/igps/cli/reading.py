@@ -13,9 +13,8 @@ from typing import Any
 from torch import Tensor
 
 from igps._arrays import Floats, Singles
-from igps._parameters import check_positive
 from igps._text import counted
-from igps.cli.options import ClassRule, Mirror, Size
+from igps.cli.options import ClassRule, Mirror, Size, limits_of
 from igps.data.attribute_sources import attribute_sources
 from igps.data.cache import default_cache_dir
 from igps.data.dataset import Failure, SignatureDataset
@@ -25,7 +24,6 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.measures import Measures
 from igps.descriptors.size_and_side import SIDE, SIZE, keeps_size, scale_of
-from igps.failures import Limits
 from igps.fields.volumes.border import border_of
 from igps.mesh.mending import repair_steps
 from igps.mesh.mesh import MILLIMETRES
@@ -35,6 +33,7 @@ from igps.nn.descriptor import Descriptor
 from igps.report.tables import write_rows
 from igps.signature.signature import SignatureConfig
 
+_N_REASONS = 20  # of bodies that could not be used; more would hide the results above them
 _RESIDUES = re.compile(r"(\d+) (residues .*)")
 
 
@@ -194,22 +193,20 @@ def is_named_after_file(name: str, part: str | None) -> bool:
     return Path(file_name_of(name, part)).name.startswith(f"{part}.")
 
 
-def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:
-    """Return the limits of one body; raise a ValueError that names the option if a number is not positive."""
-    limits = {"time_limit": seconds, "memory_limit": gigabytes}
-    check_positive(**{name: limit for name, limit in limits.items() if limit is not None})
-    return Limits(seconds, None if gigabytes is None else int(gigabytes * 1e9))
-
-
 def print_failures(failures: Sequence[Failure], n_used: int) -> None:
-    """Print how many bodies could not be used, and the reason of the first; print nothing if there are none.
+    """Print how many bodies could not be used, and why, a line for each; print nothing if there are none.
 
     Empty masks do not count: they are no fault, and a warning has told of them.
     """
     faults = [failure for failure in failures if not failure.summary]
-    if faults:
-        n_all = counted(n_used + len(failures), "body")
-        print(f"{len(faults)} of {n_all} could not be used. The first: {faults[0].error}")
+    if not faults:
+        return
+    n_all = counted(n_used + len(failures), "body")
+    print(f"{len(faults)} of {n_all} could not be used.")
+    for failure in faults[:_N_REASONS]:
+        print(f"  {failure.error}")
+    if len(faults) > _N_REASONS:
+        print(f"  … and {len(faults) - _N_REASONS} more")
 
 
 def with_side(descriptor: str, mirror: Mirror, size: Size) -> str:

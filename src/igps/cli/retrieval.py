@@ -46,43 +46,62 @@ def retrieve(
             scores in a second table; distances.npz holds them as "reranked".
     """
     from igps.analysis.comparison import pair_distances
-    from igps.analysis.plain_numbers import plain_scores, plain_table
     from igps.cli.reading import Folder, described, print_failures
     from igps.cli.report import check_report_folder
     from igps.cli.report import report as write_report
-    from igps.report.tables import scores_table
     from igps.retrieval import rerank as reranked_distances
-    from igps.retrieval import scores_of_queries
 
     check_report_folder(report, out)
     if report and queries is not None:
         raise ValueError("report: expected no --queries with it: on the page, each body asks.")
-    check = partial(_check_scored, queries=queries)
+    check = partial(_check_scored, queries=queries, needs_scores=out is None)
     result = described(Folder(root, labelled=True, check=check), descriptor, **describing)
-    labels = result.dataset.bodies.labels or ()
     is_query = check(result.dataset.bodies)
     distances = {"distances": pair_distances(result.descriptor, result.descriptions, progress=True)}
-    scores = scores_of_queries(distances["distances"], labels, is_query)
-    plain = plain_scores(result.dataset, is_query)
-    beside = plain_table(plain, result.descriptor.name, scores)
-    summary = _summary(result, scores)
-    summary["plain_numbers"] = {name: row.mean() for name, row in plain.items()}
-    tables = scores_table(scores)
     if rerank:
         distances["reranked"] = reranked_distances(distances["distances"])
-        scores = scores_of_queries(distances["reranked"], labels, is_query)
-        summary["reranked"] = _means(scores)
-        tables += f"\n\nre-ranked by the whole collection, without labels\n{scores_table(scores)}"
+    summary = _summary(result)
+    tables = "no class has two bodies: rankings without scores"
+    if _has_pairs(result.dataset.bodies):
+        scores, tables = _scored(result, distances, is_query)
+        summary = {**scores, **summary}
     if out is not None:  # before printing, because a closed pipe, as of `head`, ends the command
         _write_retrieval(out, result, summary, distances, is_query)
     print(tables)
-    print(beside)
     print_failures(result.failures, len(result.dataset))
     if out is not None:
         print(f"written to {out}")
         if report:
             write_report(out, n_workers=describing.get("n_workers"))
     return summary
+
+
+def _scored(
+    result: Described, distances: dict[str, Tensor], is_query: list[bool] | None
+) -> tuple[dict[str, Any], str]:
+    """Return the scores for scores.json, and the tables of them to print."""
+    from igps.analysis.plain_numbers import plain_scores, plain_table
+    from igps.report.tables import scores_table
+    from igps.retrieval import scores_of_queries
+
+    labels = result.dataset.bodies.labels or ()
+    scores = scores_of_queries(distances["distances"], labels, is_query)
+    plain = plain_scores(result.dataset, is_query)
+    summary = {
+        **_means(scores),
+        "n_queries": scores.n_queries,
+        "per_class": {str(label): values for label, values in scores.per_class().items()},
+        "plain_numbers": {name: row.mean() for name, row in plain.items()},
+    }
+    tables = [scores_table(scores)]
+    if "reranked" in distances:
+        reranked = scores_of_queries(distances["reranked"], labels, is_query)
+        summary["reranked"] = _means(reranked)
+        tables.append(
+            f"\nre-ranked by the whole collection, without labels\n{scores_table(reranked)}"
+        )
+    tables.append(plain_table(plain, result.descriptor.name, scores))
+    return summary, "\n".join(tables)
 
 
 def extract(
@@ -271,7 +290,7 @@ def _describe_body(mesh: Path, descriptor: Descriptor, **describing: Any) -> Ten
     return result.descriptions
 
 
-def _check_scored(bodies: Bodies, queries: str | None) -> list[bool] | None:
+def _check_scored(bodies: Bodies, queries: str | None, needs_scores: bool) -> list[bool] | None:
     """Return which bodies are queries, None if all are; raise a ValueError if there is nothing to score."""
     if queries is not None:
         is_query = [fnmatchcase(name, queries) for name in bodies.names]
@@ -282,28 +301,30 @@ def _check_scored(bodies: Bodies, queries: str | None) -> list[bool] | None:
                 f"{queries!r}. The first is called {bodies.names[0]}."
             )
         return is_query
-    if len(set(bodies.labels or ())) == len(bodies):
+    if needs_scores and not _has_pairs(bodies):
         raise ValueError(
             f"root: expected a class of two bodies or more, got {len(bodies)} classes of one. Put similar bodies into "
-            "one class."
+            "one class, or give --out for rankings without scores."
         )
     return None
+
+
+def _has_pairs(bodies: Bodies) -> bool:
+    """Return whether two bodies share a class."""
+    return len(set(bodies.labels or ())) < len(bodies)
 
 
 def _means(scores: RetrievalScores) -> dict[str, float]:
     return scores.mean() | (scores.single_answers() if scores.has_single_answers else {})
 
 
-def _summary(result: Described, scores: RetrievalScores) -> dict[str, Any]:
+def _summary(result: Described) -> dict[str, Any]:
     n_used = len(result.dataset)
     n_refused = len(result.failures)
     return {
-        **_means(scores),
-        "n_queries": scores.n_queries,
         "n_given": n_used + n_refused,
         "n_used": n_used,
         "n_refused": n_refused,
-        "per_class": {str(label): values for label, values in scores.per_class().items()},
         "config": {
             "descriptor": result.name or result.descriptor.name,
             **result.dataset.config.as_dict(),

@@ -1,4 +1,4 @@
-"""Cache of Signatures, attributes, descriptions, failures, listings and pictures: one safetensors file for each key."""
+"""Cache of surfaces, Signatures and what is made of them, failures and listings: one safetensors file for each key."""
 
 import json
 import logging
@@ -20,7 +20,7 @@ from igps.signature.signature import SAMPLE_KINDS, Samples, Signature, Signature
 
 logger = logging.getLogger(__name__)
 
-Kind = Literal["signature", "attribute", "description", "failure", "listing", "picture"]
+Kind = Literal["surface", "signature", "attribute", "description", "failure", "listing", "picture"]
 
 _FORMAT = "igps-cache-3"
 # Fields of a Signature besides arrays and configuration
@@ -82,17 +82,21 @@ class Cache:
 
         def value(file: Any, texts: Mapping[str, str]) -> T:
             names = file.keys()
-            record = Record({name: file.get_tensor(name).numpy() for name in names}, texts)
+            arrays = {name: np.asarray(file.get_tensor(name)) for name in names}
+            record = Record(arrays, texts)
             check_checksum(record)
             return decode(record)
 
-        return self._read(key, value)
+        # torch maps arrays without a copy, but takes a second to load, which small ones are not worth
+        framework = "numpy" if self.kind == "surface" else "pt"
+        return self._read(key, value, framework)
 
-    def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], T]) -> T | None:
+    def _read(
+        self, key: str, read: Callable[[Any, Mapping[str, str]], T], framework: str = "numpy"
+    ) -> T | None:
         path = self.path(key)
         try:
-            # framework="numpy" would copy every array
-            with safe_open(path, framework="pt") as file:
+            with safe_open(path, framework=framework) as file:
                 texts = file.metadata() or {}
                 if texts.get("format") != _FORMAT or texts.get("key") != key:
                     raise ValueError(f"not a {_FORMAT} file of this key")

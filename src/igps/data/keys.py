@@ -71,9 +71,9 @@ def content_digest(*files: Path) -> bytes:
 
 
 def signature_key(
-    content: Content, body: BodyRef, reading: LoadOptions, config: SignatureConfig
+    content: Content, body: BodyRef, reading: LoadOptions, config: SignatureConfig | None
 ) -> str:
-    """Return the key of the Signature of a body."""
+    """Return the key of the Signature of a body; without a configuration, of its surface as it was read."""
     # The suffix selects the reader: the same lines in .pdb.gz and .pqr.gz are different molecules
     name = body.path.name.lower()
     suffix = ".pqr.gz" if name.endswith(".pqr.gz") else Path(name).suffix
@@ -95,9 +95,11 @@ def _parameters(
     part: str | None,
     number: str | None,
     reading: LoadOptions,
-    config: SignatureConfig,
+    config: SignatureConfig | None,
 ) -> bytes:
     """Return the part of a key that is not the content; remembered, because thousands of files share it."""
+    # With the version of the algorithm
+    parameters = SignatureConfig.ALGORITHM_VERSION if config is None else config.as_dict()
     fields = {
         "suffix": suffix,
         "part": part,
@@ -105,7 +107,7 @@ def _parameters(
         "reading": reading.as_dict(),
         "mending": MENDING_VERSION,
         "measures": MEASURES_VERSION,
-        "config": config.as_dict(),  # with the version of the algorithm
+        "config": parameters,
     }
     return json.dumps(fields, sort_keys=True).encode()
 

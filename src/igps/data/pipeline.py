@@ -3,7 +3,7 @@
 import importlib.metadata
 import logging
 import socket
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,17 +12,20 @@ from typing import Any, Protocol
 import numpy as np
 
 from igps._arrays import Singles
+from igps._threads import one_thread
 from igps.data.added_attributes import AttributeSource, with_attribute
 from igps.data.attribute_sources import with_load_options
 from igps.data.cache import Cache, Kind, Record, decode, encode
 from igps.data.cache_hit import CacheHit
 from igps.data.keys import Content, FileDigest, derived_key, signature_key
+from igps.data.surfaces import known_surface, surface_record
 from igps.failures import Failed, MachineError, attempt
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of, names_of
-from igps.mesh.loading import BodyRef, each_body, load_mesh
+from igps.mesh.loading import BodyRef, each_surface, read_surface, surface_body
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
+from igps.mesh.raw_body import RawBody
 from igps.signature.signature import (
     SAMPLE_KINDS,
     SampleKind,
@@ -70,15 +73,53 @@ class SignaturePipeline:
         """Return the cache of Signatures, attributes, descriptions or failures."""
         return Cache(self.cache_dir, kind)
 
-    def mesh(self, body: BodyRef) -> Mesh:
+    def mesh(self, body: BodyRef, content: Content | None = None) -> Mesh:
         """Return the checked mesh of a body; raise a MeshError if it cannot be used."""
         if body in self.meshes:
             mesh = self.meshes[body]
             if isinstance(mesh, MeshError):
                 raise mesh
             return mesh
+        content = content or self.content(body)
+        raw = self._known_surface(body, content)
+        if raw is None:
+            raw = read_surface(body.path, self.reading, part=body.part)
+            self.keep_surface(body, content, raw)
+        return self._body(raw, BodyRef(body.path, raw.part))
+
+    @one_thread()
+    def _body(self, raw: RawBody, body: BodyRef) -> Mesh:
         least_vertices = self.config.n_vertices_read
-        return load_mesh(body.path, self.reading, part=body.part, least_vertices=least_vertices)
+        return surface_body(raw, body, self.reading, least_vertices=least_vertices)
+
+    def _surfaces(
+        self, bodies: Iterable[BodyRef], content: Content
+    ) -> Iterator[tuple[BodyRef, RawBody]]:
+        """Iterate over the unchecked surfaces of bodies of one file, which is read for those that are not cached."""
+        unread: dict[str | None, BodyRef] = {}
+        for body in bodies:
+            known = self._known_surface(body, content)
+            if known is None:
+                unread[body.part] = body
+            else:
+                yield body, known
+        if not unread:
+            return
+        path = next(iter(unread.values())).path
+        for ref, raw in each_surface(path, self.reading, parts=[*unread]):
+            body = unread[ref.part]
+            self.keep_surface(body, content, raw)
+            yield body, raw
+
+    def _known_surface(self, body: BodyRef, content: Content) -> RawBody | None:
+        key = signature_key(content, body, self.reading, None)
+        return known_surface(self.cache("surface"), key, body.part)
+
+    def keep_surface(self, body: BodyRef, content: Content, raw: RawBody) -> None:
+        """Store the surface of a label, which took time to compute."""
+        if raw.voxels is not None and raw.fault is None:
+            key = signature_key(content, body, self.reading, None)
+            self.put("surface", key, surface_record(raw))
 
     def content(self, body: BodyRef, known: Mapping[Path, FileDigest] | None = None) -> Content:
         """Return the content of a body, with the digests of files that are known; raise a MeshError if unreadable."""
@@ -105,10 +146,7 @@ class SignaturePipeline:
             return None
         texts = self.cache("signature").texts(keys.key)
         if texts is None:
-            failure = self.cache("failure").texts(self._failure_key(body, content))
-            if failure is None:
-                return None
-            return Failed(failure["reason"], failure.get("summary", ""))
+            return self._known_failure(body, content)
         attributes = self.cache("attribute")
         if not all(key in attributes for key in keys.attributes.values()):
             return None
@@ -165,23 +203,20 @@ class SignaturePipeline:
         content = self.content(bodies[0])
         found = {body: self.find(body, content) for body in bodies}
         outcomes = {body: outcome for body, outcome in found.items() if outcome is not None}
-        missing = {body.part: body for body in bodies if body not in outcomes}
-        least_vertices = self.config.n_vertices_read
+        missing = [body for body in bodies if body not in outcomes]
         try:
-            meshes = each_body(
-                bodies[0].path, self.reading, parts=[*missing], least_vertices=least_vertices
-            )
-            for ref, mesh in meshes:
-                body = missing[ref.part]
-                if isinstance(mesh, MeshError):
-                    self._remember(body, content, mesh)
-                    outcomes[body] = Failed.of(mesh)
+            for body, raw in self._surfaces(missing, content):
+                try:
+                    mesh = self._body(raw, body)
+                except MeshError as error:
+                    self.remember(body, content, error)
+                    outcomes[body] = Failed.of(error)
                 else:
                     outcomes[body] = attempt(partial(self.hit, body, content, mesh))
         except MeshError as error:  # in the file, and thus in all bodies that were not read before
-            for body in missing.values():
+            for body in missing:
                 if body not in outcomes:
-                    self._remember(body, content, error)
+                    self.remember(body, content, error)
                     outcomes[body] = Failed.of(error)
         for body in bodies:
             if body not in outcomes:  # it is not in the file, which `hit` reports
@@ -236,11 +271,13 @@ class SignaturePipeline:
         signature = cache.get(key, decode)
         if signature is not None:
             return signature
+        config = None  # on which reading does not depend
         try:
-            mesh = self.mesh(body) if mesh is None else mesh
-            signature = compute_signature(mesh, self.config)
+            mesh = self.mesh(body, content) if mesh is None else mesh
+            config = self.config
+            signature = compute_signature(mesh, config)
         except MeshError as error:
-            self._remember(body, content, error)
+            self.remember(body, content, error, config)
             raise
         self.put("signature", key, encode(signature))
         return signature
@@ -263,17 +300,31 @@ class SignaturePipeline:
         self.put("attribute", key, Record(values))
         return values
 
-    def _failure_key(self, body: BodyRef, content: Content) -> str:
+    def _failure_key(self, body: BodyRef, content: Content, config: SignatureConfig | None) -> str:
         # A message names the file, and another version of the library may be able to read it
-        key = signature_key(content, body, self.reading, self.config)
+        key = signature_key(content, body, self.reading, config)
         return derived_key("failure", key, str(body), version())
 
-    def _remember(self, body: BodyRef, content: Content, error: MeshError) -> None:
-        """Keep the reason why a body cannot be used, unless the machine may be at fault."""
+    def _known_failure(self, body: BodyRef, content: Content) -> Failed | None:
+        """Return why a body could not be used before, with any configuration or with this one."""
+        for config in (None, self.config):
+            failure = self.cache("failure").texts(self._failure_key(body, content, config))
+            if failure is not None:
+                return Failed(failure["reason"], failure.get("summary", ""))
+        return None
+
+    def remember(
+        self,
+        body: BodyRef,
+        content: Content,
+        error: MeshError,
+        config: SignatureConfig | None = None,
+    ) -> None:
+        """Keep why a body cannot be used, with a configuration or any, unless the machine may be at fault."""
         if body in self.meshes or isinstance(error.__cause__, OSError):
             return
         record = Record({}, {"reason": str(error), "summary": error.summary})
-        self.put("failure", self._failure_key(body, content), record)
+        self.put("failure", self._failure_key(body, content, config), record)
 
 
 def _values_of(record: Record) -> dict[SampleKind, Singles]:

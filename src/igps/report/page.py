@@ -9,7 +9,7 @@ from typing import Any
 from igps.report.page_data import N_WORST, base64_text, data_of
 from igps.report.pictures import PageSurface
 from igps.report.results import Results
-from igps.report.tables import TITLES
+from igps.report.tables import PAIR_TITLES, TITLES, score_cell
 
 _TEMPLATE = files("igps.report") / "template"
 _SCRIPTS = ("three.min.js", "bodies.js", "tables.js", "map.js", "tree.js", "page.js")
@@ -26,6 +26,9 @@ SCORE_MEANINGS = dict(  # noqa: C408
     adr="average dynamic recall",
     adr_self="average dynamic recall with the query itself in the ranking, as in SHREC'07",
     map="mean average precision",
+    first_5="share of queries whose other shape is among the nearest 5",
+    first_10="share of queries whose other shape is among the nearest 10",
+    median_rank="median rank of the other shape, from 1",
 )
 """Explanations of the scores by name."""
 
@@ -66,7 +69,8 @@ def render_page(results: Results, surfaces: Mapping[str, PageSurface]) -> str:
         style=style,
         policy=policy,
         licence=(_TEMPLATE / "three.LICENSE").read_text(encoding="utf-8"),
-        titles=TITLES,
+        titles=_titles(data),
+        score_cell=score_cell,
         meanings=SCORE_MEANINGS,
         curves=[_curve(i, system) for i, system in enumerate(data["systems"]) if system["curve"]],
         n_worst=N_WORST,
@@ -90,6 +94,13 @@ def _title(results: Results, data: Mapping[str, Any]) -> str:
     names = [system.name for system in results.systems]
     descriptors = names[0] if len(names) == 1 else f"{len(names)} descriptors"
     return f"{shapes}, {descriptors}"
+
+
+def _titles(data: Mapping[str, Any]) -> dict[str, str]:
+    """Return the column titles of the scores that the systems have, by name."""
+    titles = TITLES | PAIR_TITLES
+    known = {name for system in data["systems"] for name in system["scores"] or ()}
+    return {name: titles[name] for name in titles if name in known}
 
 
 def _curve(i: int, system: Mapping[str, Any]) -> dict[str, Any]:

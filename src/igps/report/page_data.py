@@ -109,9 +109,9 @@ def _system_data(
     """Return the data of a descriptor.
 
     These are the `shapes` that it describes (indices among all shapes); for each of them the `top` nearest others,
-    `ranked` (uint32) and their `distances` (float32), both (N, top); mean scores, scores per class and per query; the
-    precision–recall `curve`; the `confusion`, see `_confusion`; the `worst` confusions, see `_worst`; and the `map`,
-    see `_map`.
+    `ranked` (uint32) and their `distances` (float32), both (N, top); mean scores, scores per class and per query, and
+    the precision–recall `curve`, of which classes of two have only some, see `_scores_of_pairs`; the `confusion`, see
+    `_confusion`; the `worst` confusions, see `_worst`; and the `map`, see `_map`.
     """
     order = system.ranked()
     nearest = order[:, :n_ranked]
@@ -122,15 +122,10 @@ def _system_data(
         system.labels
     ):  # some shapes share a class
         scores = retrieval_scores(system.distances, system.labels)
-        curve = precision_recall_curve(system.distances, system.labels)
-        by_class = {str(label): values for label, values in scores.per_class().items()}
-        numbers = {
-            "scores": scores.mean(),
-            "per_class": [by_class.get(name) for name in classes],
-            "per_query": {name: getattr(scores, name).tolist() for name in _QUERY_SCORES},
-            "curve": [curve.recall.tolist(), curve.precision.tolist()],
-        }
-        scored = {**finite(numbers, _DECIMALS), "worst": _worst(system, order, scores, indices)}
+        numbers = _scores_of_pairs(scores)
+        if not scores.has_single_answers:
+            numbers = _scores_of_classes(scores, system, classes)
+        scored |= {**finite(numbers, _DECIMALS), "worst": _worst(system, order, scores, indices)}
     return {
         "name": system.name,
         "seconds": system.seconds_per_mesh,
@@ -141,6 +136,28 @@ def _system_data(
         **scored,
         "confusion": None if system.labels is None else _confusion(order, system.labels, classes),
         "map": _map(system),
+    }
+
+
+def _scores_of_classes(
+    scores: RetrievalScores, system: System, classes: Sequence[str]
+) -> dict[str, Any]:
+    curve = precision_recall_curve(system.distances, system.labels or ())
+    by_class = {str(label): values for label, values in scores.per_class().items()}
+    return {
+        "scores": scores.mean(),
+        "per_class": [by_class.get(name) for name in classes],
+        "per_query": {name: getattr(scores, name).tolist() for name in _QUERY_SCORES},
+        "curve": [curve.recall.tolist(), curve.precision.tolist()],
+    }
+
+
+def _scores_of_pairs(scores: RetrievalScores) -> dict[str, Any]:
+    """Return what suits queries with one other shape of their class: tiers, curves and classes would tell no more."""
+    ranks = 1 / scores.map
+    return {
+        "scores": scores.single_answers(),
+        "per_query": {"nn": scores.nn.tolist(), "rank": ranks.tolist()},
     }
 
 

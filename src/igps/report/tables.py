@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from igps._text import counted
 from igps.data.filling import left_out
-from igps.retrieval import RetrievalScores
 
 if TYPE_CHECKING:
     from igps.analysis.comparison import Result
     from igps.analysis.doctor import Finding
     from igps.analysis.groups import GroupTest
+    from igps.retrieval import RetrievalScores
 
 TITLES = {
     "nn": "NN",
@@ -28,6 +28,15 @@ TITLES = {
     "map": "mAP",
 }
 """Column titles of the scores, by name."""
+
+PAIR_TITLES = {
+    "nn": "NN",
+    "first_5": "first 5",
+    "first_10": "first 10",
+    "map": "mAP",
+    "median_rank": "median rank",
+}
+"""Column titles of `RetrievalScores.single_answers`, by name."""
 
 
 def write_rows(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
@@ -49,10 +58,8 @@ def scores_table(scores: RetrievalScores) -> str:
     """
     if scores.has_single_answers:
         found = scores.single_answers()
-        titles = ("NN", "first 5", "first 10", "mAP", "median rank")
-        cells = [f"{100 * found[name]:.1f}" for name in ("nn", "first_5", "first_10", "map")]
-        cells.append(f"{found['median_rank']:.0f}")
-        lines = ["".join(f"{cell:>12}" for cell in row) for row in (titles, cells)]
+        cells = [score_cell(name, found[name]) for name in PAIR_TITLES]
+        lines = ["".join(f"{cell:>12}" for cell in row) for row in (PAIR_TITLES.values(), cells)]
         of_queries = "each with one body of its class among those that it asks"
         lines.append(f"percent, {scores.n_queries} queries, {of_queries}; mAP: mean of 1/rank")
         return "\n".join(lines)
@@ -76,6 +83,13 @@ def scores_table(scores: RetrievalScores) -> str:
     return "\n".join(lines)
 
 
+def score_cell(name: str, value: float | None) -> str:
+    """Return a score in percent, or a rank, as it stands in tables; a dash if it is not known."""
+    if value is None:
+        return "–"
+    return f"{value:.0f}" if name == "median_rank" else f"{100 * value:.1f}"
+
+
 def comparison_table(results: Sequence[Result]) -> str:
     """Return a text table with one line per descriptor: scores in percent, meshes described, seconds per mesh."""
     rows = [result.row() for result in results]
@@ -84,9 +98,7 @@ def comparison_table(results: Sequence[Result]) -> str:
         " " * width + "".join(f"{title:>10}" for title in (*TITLES.values(), "meshes", "s/mesh"))
     ]
     for row in rows:
-        scores = "".join(
-            f"{'–' if row[key] is None else f'{100 * row[key]:.1f}':>10}" for key in TITLES
-        )
+        scores = "".join(f"{score_cell(key, row[key]):>10}" for key in TITLES)
         seconds = "–" if row["seconds_per_mesh"] is None else f"{row['seconds_per_mesh']:.3f}"
         lines.append(f"{row['descriptor']:<{width}}{scores}{row['n_models']:>10}{seconds:>10}")
     lines.append("scores in percent, each mesh against all others that the descriptor describes")

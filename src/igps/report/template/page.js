@@ -143,9 +143,13 @@ function factsOf(shape) {
     if (values[shape] != null) facts.push(fact(title, values[shape]));
   }
   if (scores && row !== undefined && scores.nn[row] !== null) {
-    facts.push(fact("first tier", `${percent(scores.ft[row])} %`));
-    facts.push(fact("second tier", `${percent(scores.st[row])} %`));
-    facts.push(fact("average precision", `${percent(scores.map[row])} %`));
+    if (scores.rank) {
+      facts.push(fact("rank of the other of its class", scores.rank[row]));
+    } else {
+      facts.push(fact("first tier", `${percent(scores.ft[row])} %`));
+      facts.push(fact("second tier", `${percent(scores.st[row])} %`));
+      facts.push(fact("average precision", `${percent(scores.map[row])} %`));
+    }
   }
   if (mesh) {
     facts.push(fact("mesh", `${mesh[0].toLocaleString("en")} vertices, ${mesh[1].toLocaleString("en")} faces`));
@@ -192,13 +196,14 @@ function confusion({ query, rank, wrong }) {
   const descriptor = systems[system];
   const button = picture(query);
   button.append(element("span", { class: "about" }, "query"));
-  const tier = percent(descriptor.per_query.ft[descriptor.row.get(query)]);
+  const tiers = descriptor.per_query.ft; // none for classes of two
+  const tier = tiers ? ` First tier: ${percent(tiers[descriptor.row.get(query)])} %.` : "";
   return element(
     "li",
     {},
     button,
     element("ol", { class: "wall" }, ...wrong.map((position) => card(query, ranking[position - 1], position))),
-    element("p", {}, `First of the same class at rank ${rank} of ${descriptor.shapes.length - 1}. First tier: ${tier} %.`),
+    element("p", {}, `First of the same class at rank ${rank} of ${descriptor.shapes.length - 1}.${tier}`),
   );
 }
 
