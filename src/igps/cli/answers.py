@@ -125,7 +125,7 @@ def groups(
         return with_q_values(found)
 
     tests = tested(jobs)
-    numbers = tested(by_number)
+    numbers = tested(by_number) if by_number else []
     print(groups_table(tests))
     if numbers:
         numbers.sort(key=lambda test: 1 if test.permanova_p is None else test.permanova_p)
