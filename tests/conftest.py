@@ -23,6 +23,19 @@ TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 
+@pytest.fixture(autouse=True, scope="session")
+def one_core(tmp_path_factory):
+    """As in a container of one core: to start processes takes longer than the work of most tests.
+
+    Tests of several processes say how many.
+    """
+    quota = tmp_path_factory.mktemp("container") / "cpu.max"
+    quota.write_text("100000 100000")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("igps._threads.CPU_QUOTA", quota)
+        yield
+
+
 @pytest.fixture
 def many_cores(monkeypatch):
     """As on a machine of eight cores."""

@@ -35,8 +35,6 @@ def test_the_ten_lines_work_with_descriptors_of_each_kind(folder, name, monkeypa
     example = "\n".join(lines).replace('"interior"', repr(name))
     assert repr(name) in example
     monkeypatch.chdir(folder)
-    # Starting processes would take longer than all the rest
-    monkeypatch.setattr("igps._parallel.n_cores", lambda: 1)
     exec(compile(example, str(README), "exec"), {})
     scores, nearest = capsys.readouterr().out.splitlines()
     assert ast.literal_eval(scores)["nn"] >= 0.5  # by chance 0.4
