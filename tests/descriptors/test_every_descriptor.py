@@ -23,6 +23,7 @@ from igps.data.collation import collate
 from igps.data.requirements import Requirements
 from igps.descriptors import NAMES, descriptor
 from igps.mesh.mesh import Mesh
+from igps.nn.axes import Attribute
 from igps.nn.descriptor import BodyDescriptor, EmbeddedDescriptor
 from igps.retrieval import cosine
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
@@ -165,6 +166,10 @@ def test_tensors_are_made_on_the_device_of_the_bodies(name, compiled, request):
     assert not distances.is_meta
 
 
+def modules_of(name):
+    return {type(one) for one in descriptor(name).modules()}
+
+
 def fewer_samples(batch, n):
     return replace(
         batch, interior=batch.interior.subset(n, seed=0), surface=batch.surface.subset(n, seed=0)
@@ -205,8 +210,11 @@ def test_a_batch_on_a_device_is_described_at_once(name, monkeypatch):
     assert_close(together, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
 
 
-@pytest.mark.parametrize("name", ON_TENSORS)
+@pytest.mark.parametrize("name", ["interior", "pretrained"])
 def test_any_number_of_bodies_goes_through_an_exported_program(name):
+    """Other descriptors are made of the same modules, and of attributes, which the tests of pipelines export."""
+    for other in ("gps", "multiscale", "rich"):
+        assert modules_of(other) <= modules_of("pretrained") | {Attribute}
     rod, other = (body(kind) for kind in ("rod", "other"))
     found = descriptor(name)
     several = SignatureBatch.concatenate([other, rod, other, body("pose")])
