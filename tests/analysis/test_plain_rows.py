@@ -5,8 +5,9 @@ import pytest
 import trimesh
 
 import igps
-from igps.analysis.plain_numbers import plain_scores, plain_table
+from igps.analysis.plain_numbers import plain_scores
 from igps.descriptors.measures import Measures
+from igps.report.tables import plain_table
 from igps.retrieval import retrieval_scores
 
 SPHERE = trimesh.creation.icosphere(subdivisions=3)
@@ -30,7 +31,7 @@ def test_size_alone_tells_small_balls_from_large_ones_and_the_table_says_so(tmp_
     assert rows["measures+size"].mean()["ft"] == 1
     assert rows["measures"].mean()["ft"] < 0.9
     table = plain_table(rows, "pretrained", rows["measures"])
-    assert "measures+size     100.0     100.0     100.0" in table
+    assert "measures+size  100.0  100.0  100.0" in table
     assert "measures, measures+size find these classes as well as pretrained or better" in table
 
 

@@ -15,7 +15,7 @@ from igps.analysis.clusters import clusters_of
 from igps.analysis.groups import group_test
 from igps.analysis.map import body_map
 from igps.analysis.outliers import LIMIT
-from igps.cli.answers import _extent
+from igps.cli.explain import _extent
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
 from igps.report.figures import clusters_figure, map_figure, write_analysis
@@ -155,8 +155,8 @@ def test_volumes_are_compared_in_one_unit(tmp_path, monkeypatch, capsys):
         in capsys.readouterr().out
     )
     assert float(table(tmp_path / "groups.csv")[1]["effect"]) > 0.9
-    igps(monkeypatch, root, "map", root, *OWN, "--colour", "volume", "--out", tmp_path)
-    found = {row["name"][:-4]: float(row["volume"]) for row in table(tmp_path / "map.csv")}
+    igps(monkeypatch, root, "clusters", root, *OWN, "--colour", "volume", "--out", tmp_path)
+    found = {row["name"][:-4]: float(row["volume"]) for row in table(tmp_path / "clusters.csv")}
     for label, of_each in heights.items():
         for i, height in enumerate(of_each):
             assert found[f"{label}/{i}"] == pytest.approx(found["low/0"] * height, rel=1e-5)
@@ -451,7 +451,7 @@ def test_clusters_are_the_two_kinds_of_eggs(root, tmp_path, monkeypatch, capsys)
     clusters = {row["name"]: row["cluster"] for row in rows}
     assert [clusters[f"short{i}.off"] for i in range(6)] == [clusters["long6.off"]] * 6 == ["1"] * 6
     assert [clusters[f"long{i}.off"] for i in range(6)] == ["2"] * 6
-    assert "(6 short, 1 long)" in printed
+    assert "6 short, 1 long" in printed
     assert "2 of 2 clusters are stable (at least 0.75)\n" in printed
     assert imread(tmp_path / "figures" / "clusters.png").std() > 0.02
     assert "long6.off" in (tmp_path / "figures" / "clusters.json").read_text()
@@ -466,8 +466,8 @@ def test_a_stability_that_was_not_measured_is_unknown(root, monkeypatch, capsys)
 def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
     colour, root, tmp_path, monkeypatch, capsys
 ):
-    igps(monkeypatch, root, "map", root, *OWN, "--colour", colour, "--out", tmp_path)
-    rows = table(tmp_path / "map.csv")
+    igps(monkeypatch, root, "clusters", root, *OWN, "--colour", colour, "--out", tmp_path)
+    rows = table(tmp_path / "clusters.csv")
     dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
     found = body_map(chi_square(*2 * [describe(dataset, small_interior())]).numpy())
     assert np.array([[row["x"], row["y"]] for row in rows], dtype=float) == pytest.approx(
@@ -487,13 +487,14 @@ def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
     assert (tmp_path / "map.svg").read_text().startswith("<?xml")
 
 
-def test_a_column_called_as_the_coordinates_leaves_them_alone(root, tmp_path, monkeypatch):
+def test_a_column_called_as_the_coordinates_leaves_them_alone(root, tmp_path, monkeypatch, capsys):
     rows = table(root / "labels.csv")
     (tmp_path / "labels.csv").write_text(
         "file,x\n" + "".join(f"{root / row['file']},7\n" for row in rows)
     )
     igps(monkeypatch, root, "map", tmp_path, *OWN, "--colour", "x", "--out", tmp_path)
-    found = table(tmp_path / "map.csv")
+    assert "igps: map is a part of igps clusters now." in capsys.readouterr().err
+    found = table(tmp_path / "clusters.csv")
     assert {row["x of labels.csv"] for row in found} == {"7.0"}
     assert len({row["x"] for row in found}) == len(rows)
 
@@ -539,7 +540,7 @@ def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path):
     ("command", "message"),
     [
         (
-            ["map", "--colour", "weight"],
+            ["clusters", "--colour", "weight"],
             "weight: no such column of labels.csv; further columns: scanner, age",
         ),
         (

@@ -725,13 +725,12 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         ),
         (["clusters", "ROOT", "--n_resamples", "-1"], "n_resamples: expected at least 0, got -1."),
         (["clusters", "TWO"], "root: expected three bodies or more, TWO has 2."),
-        (["map", "TWO"], "root: expected three bodies or more, TWO has 2."),
-        (["map", "ROOT", "--seed", "-1"], "seed: expected 0 to 4294967295, got -1."),
+        (["clusters", "ROOT", "--seed", "-1"], "seed: expected 0 to 4294967295, got -1."),
         (
             ["groups", "ROOT", "--seed", "4294967296"],
             "seed: expected 0 to 4294967295, got 4294967296.",
         ),
-        (["map", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
+        (["clusters", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
         (
             ["retrieve", "ROOT", "--with", "ct=-1"],
             "with: expected NAME or NAME=WEIGHT with a weight above 0, such as",

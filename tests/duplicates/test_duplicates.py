@@ -21,8 +21,7 @@ from igps.cli.commands import COMMANDS
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.duplicates.calibration import Calibration
-from igps.duplicates.duplicates import duplicates
-from igps.duplicates.grouping import assigned
+from igps.duplicates.duplicates import assigned, duplicates
 from igps.duplicates.surfaces import Surfaces
 from igps.signature.signature import SignatureConfig
 
@@ -105,11 +104,11 @@ def test_copies_are_grouped_and_neither_poses_nor_siblings(dataset, root):
     expected = {name: root / name for group in found.groups for name in group}
     assert found.paths == expected
     # As many pairs as join the groups, and each of one group.
-    assert len(found.pairs) == 3
-    for pair in found.pairs:
-        assert any({*pair} <= group for group in SAME)
-    assert max(found.pairs.values()) <= Calibration.load().same.distance
-    grades = {frozenset(pair): grade for pair, grade in found.grades.items()}
+    assert len(found.copies) == 3
+    for copy in found.copies:
+        assert any({*copy.names} <= group for group in SAME)
+        assert copy.distance <= Calibration.load().same.distance
+    grades = {frozenset(copy.names): copy.grade for copy in found.copies}
     assert grades.pop(frozenset({"bar.obj", "bar.ply"})) == "same mesh"
     assert set(grades.values()) == {"same at another level of detail"}
 
@@ -175,7 +174,7 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
     assert grouped(found.groups) == {
         frozenset(f"{name}#{label}" for name in names) for label in (1, 2)
     }
-    assert set(found.grades.values()) == {"same mesh"}
+    assert {copy.grade for copy in found.copies} == {"same mesh"}
 
 
 def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path):
@@ -209,7 +208,7 @@ def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path):
     assert nearer < farther < math.inf
     found = duplicates(dataset, n_workers=1)
     assert grouped(found.groups) == {frozenset({"one.off", "coarse.off"})}
-    assert list(found.pairs) == [("one.off", "coarse.off")]
+    assert [copy.names for copy in found.copies] == [("one.off", "coarse.off")]
 
 
 def test_each_file_of_a_group_has_one_finer_file_beside_it():
@@ -266,7 +265,7 @@ def test_washers_with_other_holes_are_no_copies(tmp_path):
     mirrored.export(tmp_path / "mirrored.off")
     found = duplicates(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"), n_workers=1)
     assert grouped(found.groups) == {frozenset({"one.off", "mirrored.off"})}
-    assert not found.mirrored  # a washer is its own mirror image
+    assert not any(copy.is_mirrored for copy in found.copies)  # a washer is its own mirror image
 
 
 def test_a_mirror_image_is_called_so(tmp_path):
@@ -281,8 +280,9 @@ def test_a_mirror_image_is_called_so(tmp_path):
     bracket.export(tmp_path / "right.off")
     found = duplicates(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"), n_workers=1)
     assert grouped(found.groups) == {frozenset({"left.off", "right.off", "copy.off"})}
-    assert found.mirrored == {pair for pair in found.pairs if "right.off" in pair}
-    assert len(found.mirrored) == 1
+    mirrored = [copy.names for copy in found.copies if copy.is_mirrored]
+    assert mirrored == [copy.names for copy in found.copies if "right.off" in copy.names]
+    assert len(mirrored) == 1
 
 
 def test_a_small_hole_that_is_a_little_larger_is_another_surface(tmp_path):

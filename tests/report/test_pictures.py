@@ -6,10 +6,9 @@ import trimesh
 
 from conftest import as_mesh, horseshoe
 from igps.data.dataset import SignatureDataset
-from igps.mesh.surface import components
+from igps.mesh.errors import MeshError
 from igps.report import pictures
 from igps.report.pictures import (
-    clustered,
     fitting_vertices,
     surface_of,
     surfaces_of,
@@ -84,22 +83,11 @@ def test_turned_and_moved_bodies_look_alike():
     np.testing.assert_allclose(one.vertices / 65535, two.vertices / 65535, atol=2e-3)
 
 
-def test_clusters_are_means_of_cells():
-    surface = egg()
-    vertices, faces = clustered(np.asarray(surface.vertices), np.asarray(surface.faces), 120)
-    assert 40 < len(vertices) <= 120
-    assert components(faces, len(vertices))[0] == 1
-    inside = (vertices / [1.0, 0.7, 2.5]) ** 2
-    assert (inside.sum(axis=1) <= 1 + 1e-9).all()  # means of points of a convex surface
-    found = trimesh.Trimesh(vertices, faces).area
-    expected = pytest.approx(surface.area, rel=0.1)
-    assert found == expected
-
-
-def test_where_quadrics_fail_clusters_serve(monkeypatch):
-    monkeypatch.setattr(pictures, "collapse_edges", lambda vertices, faces, n: (vertices, faces))
+def test_a_surface_of_too_many_vertices_for_the_page_is_told(monkeypatch):
+    monkeypatch.setattr(pictures, "_STEPS", 100)
     mesh = as_mesh(egg())
-    assert 40 < len(surface_of(mesh, compute_signature(mesh, CONFIG), 150).vertices) <= 150
+    with pytest.raises(MeshError, match="too many handles"):
+        surface_of(mesh, compute_signature(mesh, CONFIG), 150)
 
 
 def test_surfaces_of_the_cache_follow_their_files(tmp_path, caplog):

@@ -36,29 +36,6 @@ def plain_scores(
     return {name: scores_of_queries(values, labels, is_query) for name, values in distances.items()}
 
 
-def plain_table(rows: dict[str, RetrievalScores], descriptor: str, own: RetrievalScores) -> str:
-    """Return a table of the rows, and a sentence on which of them are ahead of a descriptor in FT."""
-    if not rows:
-        return ""
-    width = max(map(len, rows))
-    lines = [f"plain numbers beside {descriptor}, percent"]
-    titles = {"nn": "NN", "ft": "FT", "dcg": "DCG"}
-    if own.has_single_answers:
-        titles = {"nn": "NN", "map": "mAP"}
-    lines.append(" " * width + "".join(f"{title:>10}" for title in titles.values()))
-    for name, scores in rows.items():
-        means = scores.mean()
-        cells = "".join(f"{100 * means[score]:>10.1f}" for score in titles)
-        lines.append(f"{name:<{width}}{cells}")
-    ahead = [name for name, scores in rows.items() if scores.mean()["ft"] >= own.mean()["ft"]]
-    if ahead:
-        lines.append(
-            f"{', '.join(ahead)} find these classes as well as {descriptor} or better: the classes differ in plain "
-            "numbers, and the result says little about form"
-        )
-    return "\n".join(lines)
-
-
 def _of_measures(dataset: SignatureDataset) -> dict[str, Tensor]:
     """Return the distances (N, N) by plain numbers without and with size; none if a body has none."""
     found = {}

@@ -37,6 +37,7 @@ def asymmetry(
     from igps.cli.reading import Folder, described, print_failures
     from igps.fields.volumes.border import border_of
     from igps.report.figures import write_analysis
+    from igps.report.tables import text_table
 
     check_at_least(0, top=top)
 
@@ -75,17 +76,19 @@ def asymmetry(
                 "border_sides": " ".join(border.sides for border in at_border if border) or None,
             }
         )
-    width = max((len(f"{row['subject']} {row['structure']}") for row in rows), default=4)
-    print(f"{'form':>8}{'score':>7}{'size':>8}{'score':>7}  pair")
+    cells = []
     for row in rows[:top]:
-        scores = [
+        form_score, size_score = (
             "–" if row[name] is None else f"{row[name]:.1f}"
             for name in ("form_score", "size_score")
-        ]
-        name = f"{row['subject']} {row['structure']}"
-        cut = f"  at the border: {row['border_sides']}" if row["border_sides"] else ""
-        numbers = f"{row['form']:>8.3g}{scores[0]:>7}{row['size']:>+8.1%}{scores[1]:>7}"
-        print(f"{numbers}  {name:<{width}}{cut}".rstrip())
+        )
+        pair = f"{row['subject']} {row['structure']}"
+        cut = f"at the border: {row['border_sides']}" if row["border_sides"] else ""
+        cells.append(
+            (f"{row['form']:.3g}", form_score, f"{row['size']:+.1%}", size_score, pair, cut)
+        )
+    titles = ("form", "score", "size", "score", "pair", "")
+    print(text_table(titles, cells, left=("pair", "")))
     if all(one.score is None for one in found):
         print(f"no scores: fewer than {MIN_SUBJECTS} subjects have the same whole pair")
     print_failures(result.failures, len(dataset))

@@ -6,12 +6,12 @@ import importlib
 import inspect
 import re
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from igps.cli.options import COMMON, GROUPS, JSON, MEANINGS, SHARED, SIGNATURE, WITH, Option
+from igps.cli.options import GROUPS, JSON, MEANINGS, SHARED, SIGNATURE, WITH, Option
 
 COMMANDS: Mapping[str, str] = {
     "retrieve": "igps.cli.retrieval:retrieve",
@@ -22,12 +22,11 @@ COMMANDS: Mapping[str, str] = {
     "classify": "igps.cli.fit:classify",
     "train": "igps.cli.train:train",
     "inside": "igps.cli.inside:inside",
-    "groups": "igps.cli.answers:groups",
-    "explain": "igps.cli.answers:explain",
-    "outliers": "igps.cli.answers:outliers",
+    "groups": "igps.cli.groups:groups",
+    "explain": "igps.cli.explain:explain",
+    "outliers": "igps.cli.outliers:outliers",
     "asymmetry": "igps.cli.asymmetry:asymmetry",
     "clusters": "igps.cli.clusters:clusters",
-    "map": "igps.cli.clusters:map_bodies",
     "trajectory": "igps.cli.trajectory:trajectory",
     "duplicates": "igps.cli.duplicates:duplicates",
     "doctor": "igps.cli.doctor:doctor",
@@ -41,6 +40,9 @@ COMMANDS: Mapping[str, str] = {
     "help": "igps.cli.help:show_help",
 }
 """Where the function of each command is. Its module imports other packages inside its functions, see `Command`."""
+
+FORMER: Mapping[str, Sequence[str]] = {"map": ("clusters", "--colour", "class")}
+"""Words that stand for a command that is part of another now."""
 
 ENTRY_POINTS = "igps.commands"
 """The group of entry points by which other packages add commands."""
@@ -154,11 +156,6 @@ def documented_parameters(docstring: str) -> dict[str, str]:
     entries = re.split(r"^ {4}(\w+): ", section, flags=re.MULTILINE)[1:]
     texts = [" ".join(text.split()) for text in entries[1::2]]
     return dict(zip(entries[::2], texts, strict=True))
-
-
-def common(options: Iterable[Option]) -> list[Option]:
-    """Return the options that the help of each command shows."""
-    return [option for option in options if option.name in COMMON]
 
 
 def kinds_of(hint: Any) -> tuple[list[Any], bool]:

@@ -43,7 +43,7 @@ def compare(
     """
     from igps.analysis.comparison import check_names
     from igps.analysis.comparison import compare as compare_descriptors
-    from igps.analysis.plain_numbers import plain_scores, plain_table
+    from igps.analysis.plain_numbers import plain_scores
     from igps.cli.reading import Folder, signatures, with_side, with_size, write_mending_notes
     from igps.cli.report import check_report_folder
     from igps.cli.report import report as write_report
@@ -53,7 +53,7 @@ def compare(
     from igps.nn.description import fit_centres
     from igps.report.figures import precision_recall
     from igps.report.results import write_sources
-    from igps.report.tables import comparison_table
+    from igps.report.tables import comparison_table, plain_table
     from igps.retrieval import precision_recall_curve
 
     check_report_folder(report, out)

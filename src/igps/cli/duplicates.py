@@ -54,20 +54,18 @@ def duplicates(
             for name in group
         ]
         write_rows(out, ("group", "name", "path"), rows)
-    pairs: list[dict[str, Any]] = []
-    for pair, apart in result.pairs.items():
-        largest = dict(
-            zip(("largest", "largest_length", "unit"), result.largest.get(pair, ()), strict=False)
-        )
-        pairs.append(
-            {
-                "files": list(pair),
-                "distance": apart,
-                "grade": result.grades.get(pair),
-                "mirrored": pair in result.mirrored,
-                **largest,
-            }
-        )
+    pairs = [
+        {
+            "files": list(copy.names),
+            "distance": copy.distance,
+            "grade": copy.grade,
+            "mirrored": copy.is_mirrored,
+            "largest": copy.deviation,
+            "largest_length": copy.largest_length,
+            "unit": copy.unit,
+        }
+        for copy in result.copies
+    ]
     return {
         "groups": [list(group) for group in result.groups],
         "pairs": pairs,
@@ -81,13 +79,13 @@ def _print_groups(result: Duplicates) -> None:
 
     for number, group in enumerate(result.groups, 1):
         print(f"group {number}: " + "  ".join(group))
-    for pair in sorted(result.mirrored):
-        print(f"mirror image: {'  '.join(pair)}")
+    for names in sorted(copy.names for copy in result.copies if copy.is_mirrored):
+        print(f"mirror image: {'  '.join(names)}")
     threshold = Calibration.load().detail
     n_grouped = sum(map(len, result.groups))
     grades = "".join(
         f"; {counted(n, 'pair')} {grade}"
-        for grade, n in Counter(result.grades.values()).most_common()
+        for grade, n in Counter(copy.grade for copy in result.copies).most_common()
     )
     print(
         f"{n_grouped} of {result.n_files} files in {len(result.groups)} groups; on generated bodies, this finds "

@@ -106,7 +106,7 @@ def classify(
     from igps.descriptors import load
     from igps.learning.fitting import classifier_of
     from igps.learning.fitting import classify as classify_bodies
-    from igps.report.tables import write_rows
+    from igps.report.tables import text_table, write_rows
 
     module = load(model)
     classifier_of(module)  # raises for other models before anything is computed
@@ -117,26 +117,26 @@ def classify(
         failures=None if reading.get("strict") else failures,
         n_workers=reading.get("n_workers"),
     )
-    width = max(map(len, result.names))
-    print(f"{'body':<{width}}  {'probability':>11}  class")
     rows = []
+    cells = []
     best = result.probabilities.max(dim=1)
     columns = (result.names, result.predicted, best.values.tolist(), best.indices.tolist())
     for name, predicted, value, likely in zip(*columns, strict=True):
         nearest = result.classes[likely]
-        shown = f"{value:.1%}"
-        if predicted is None:  # probabilities divide 1 among known classes, and it is in none
-            shown = "-"
-        words = predicted or f"unlike every known class; the nearest is {nearest}"
-        print(f"{name:<{width}}  {shown:>11}  {words}")
+        # Probabilities divide 1 among known classes: a body of none has none
+        probability = None if predicted is None else value
         rows.append(
             {
                 "name": name,
                 "class": predicted,
                 "most_like": nearest,
-                "probability": None if predicted is None else value,
+                "probability": probability,
             }
         )
+        shown = "-" if probability is None else f"{probability:.1%}"
+        words = predicted or f"unlike every known class; the nearest is {nearest}"
+        cells.append((name, shown, words))
+    print(text_table(("body", "probability", "class"), cells, left=("body", "class")))
     print_failures(failures, len(rows))
     if out is not None:
         table = [

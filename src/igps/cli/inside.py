@@ -120,18 +120,17 @@ def inside_vectors(
 
 def _text(rows: Sequence[dict[str, Any]], attributes: Sequence[str]) -> str:
     """Return a text table of the numbers that tell most, with one line per body."""
+    from igps.report.tables import text_table
+
     shown = rows[:_N_SHOWN]
-    width = max(len(row["name"]) for row in shown)
-    lines = []
+    parts = []
     for attribute in attributes:
         titles = [f"{attribute}.{number}" for number in _SHOWN]
-        widths = [max(len(title), 9) + 2 for title in titles]
-        head = "".join(f"{title:>{w}}" for title, w in zip(titles, widths, strict=True))
-        lines.append(" " * width + head)
+        cells = []
         for row in shown:
-            cells = ("–" if row[title] is None else f"{row[title]:.4g}" for title in titles)
-            numbers = "".join(f"{cell:>{w}}" for cell, w in zip(cells, widths, strict=True))
-            lines.append(f"{row['name']:<{width}}{numbers}")
+            numbers = ["–" if row[title] is None else f"{row[title]:.4g}" for title in titles]
+            cells.append([row["name"], *numbers])
+        parts.append(text_table(["", *titles], cells, left=[""]))
     if len(rows) > len(shown):
-        lines.append(f"the first {len(shown)} of {len(rows)} bodies; --out writes all")
-    return "\n".join(lines)
+        parts.append(f"the first {len(shown)} of {len(rows)} bodies; --out writes all")
+    return "\n".join(parts)

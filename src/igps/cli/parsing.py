@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from igps.cli.commands import (
     COMMANDS,
+    FORMER,
     Command,
     command_of,
-    common,
     installed_commands,
     kinds_of,
     load_command,
@@ -30,31 +31,30 @@ def parse(words: Sequence[str], command: Command | None = None) -> tuple[Command
     Prints the help and exits if the words ask for it; exits with status 2 if they are wrong.
     """
     if command is None:
+        if words and words[0] in FORMER:
+            now = FORMER[words[0]]
+            print(f"igps: {words[0]} is a part of igps {now[0]} now.", file=sys.stderr)
+            words = [*now, *words[1:]]
         name = command_of(words)
         if name is None:
             program_parser().parse_args(words)
             raise AssertionError("a parser that accepts a command of no name")
         command = load_command(name)
     n_words = len(command.name.split())
-    return command, _given(command_parser(command), command, words[n_words:])
+    return command, _given(command, words[n_words:])
 
 
-def _given(
-    parser: argparse.ArgumentParser, command: Command, words: Sequence[str]
-) -> dict[str, Any]:
+def _given(command: Command, words: Sequence[str]) -> dict[str, Any]:
     """Return the options that the words give, by name; those of signatures as one `SignatureConfig`."""
-    shared = command.shared_options()
-    if not shared:
-        return vars(parser.parse_args(words))
-    rare = rare_parser(parser.prog, shared.values())
-    given, rest = rare.parse_known_args(words)
-    file = getattr(given, OPTIONS.name, None)
+    parser = command_parser(command)
+    given = vars(parser.parse_args(words))
+    file = given.pop(OPTIONS.name, None)
     if file is not None:
-        words = [*words_of_file(file, shared), *words]  # what is typed comes later, and wins
-        given, rest = rare.parse_known_args(words)
-    options = vars(given) | vars(parser.parse_args(rest))
-    options.pop(OPTIONS.name, None)
-    return _with_signature(options)
+        # What is typed comes later, and wins
+        words = [*words_of_file(file, command.shared_options()), *words]
+        given = vars(parser.parse_args(words))
+        del given[OPTIONS.name]
+    return _with_signature(given)
 
 
 def _with_signature(options: dict[str, Any]) -> dict[str, Any]:
@@ -73,7 +73,7 @@ def _with_signature(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def command_parser(command: Command) -> argparse.ArgumentParser:
-    """Return the parser of one command, without the rare options that commands share."""
+    """Return the parser of one command."""
     parser = argparse.ArgumentParser(**_settings(command))
     fill_parser(parser, command)
     return parser
@@ -103,27 +103,17 @@ def program_parser() -> argparse.ArgumentParser:
 
 
 def fill_parser(parser: argparse.ArgumentParser, command: Command) -> None:
-    """Add the options of a command that its help shows."""
+    """Add the options of a command. Its help leaves out the rare ones that commands share."""
     positional = command.positional()
     for option, is_required in command.own_options():
         _add(parser, option, is_positional=option.name == positional, is_required=is_required)
     shared = command.shared_options()
     if shared:
         group = parser.add_argument_group("reading")
-        for option in (*common(shared.values()), OPTIONS):
-            _add(group, option)
+        for option in (*shared.values(), OPTIONS):
+            _add(group, option, is_hidden=option.name not in (*COMMON, OPTIONS.name))
         parser.epilog = _MORE
     parser.usage = _usage(parser)
-
-
-def rare_parser(program: str, options: Iterable[Option]) -> argparse.ArgumentParser:
-    """Return a parser of the shared options that the help of a command leaves out, and of `--options`."""
-    parser = argparse.ArgumentParser(prog=program, add_help=False, allow_abbrev=False)
-    for option in options:
-        if option.name not in COMMON:
-            _add(parser, option)
-    _add(parser, OPTIONS)
-    return parser
 
 
 def shared_parser() -> argparse.ArgumentParser:
@@ -198,10 +188,11 @@ def _add(
     *,
     is_positional: bool = False,
     is_required: bool = False,
+    is_hidden: bool = False,
 ) -> None:
     """Add an option. A value that is not given stays unset, so that the default of the function holds."""
     flag = option.name if is_positional else f"--{option.name}"
-    text = option.help.replace("`", "").removesuffix(".").replace("%", "%%")
+    text = argparse.SUPPRESS if is_hidden else _help_of(option)
     settings: dict[str, Any] = {"help": text, "default": argparse.SUPPRESS}
     if option.hint is bool:
         parser.add_argument(flag, action="store_true", **settings)
@@ -219,16 +210,21 @@ def _add(
         settings["type"] = _number_or_none(kind)
     else:
         settings["type"] = kind
-    default = option.default
-    if isinstance(default, list | tuple):
-        default = " ".join(default)
-    if default not in (None, ""):
-        settings["help"] += f" (default: {default})"
     if not is_positional:
         settings["required"] = is_required
         if "choices" not in settings:
             settings["metavar"] = option.name.rpartition(".")[2].upper()
     parser.add_argument(flag, **settings)
+
+
+def _help_of(option: Option) -> str:
+    text = option.help.replace("`", "").removesuffix(".").replace("%", "%%")
+    default = option.default
+    if isinstance(default, list | tuple):
+        default = " ".join(default)
+    if option.hint is bool or default in (None, ""):
+        return text
+    return f"{text} (default: {default})"
 
 
 def _number_or_none(kind: type) -> Callable[[str], Any]:

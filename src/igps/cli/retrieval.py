@@ -80,8 +80,8 @@ def _scored(
     result: Described, distances: dict[str, Tensor], is_query: list[bool] | None
 ) -> tuple[dict[str, Any], str]:
     """Return the scores for scores.json, and the tables of them to print."""
-    from igps.analysis.plain_numbers import plain_scores, plain_table
-    from igps.report.tables import scores_table
+    from igps.analysis.plain_numbers import plain_scores
+    from igps.report.tables import plain_table, scores_table
     from igps.retrieval import scores_of_queries
 
     labels = result.dataset.bodies.labels or ()
@@ -222,6 +222,7 @@ def query(
     from igps.cli.reading import Folder, check_files, described
     from igps.gallery.gallery import Gallery
     from igps.gallery.opening import is_gallery
+    from igps.report.tables import text_table
     from igps.retrieval import N_RERANKED, rerank_candidates, search
 
     check_at_least(1, top=top)
@@ -262,12 +263,10 @@ def query(
         {"rank": place, "distance": value, "name": name, "class": label}
         for place, (name, label, value) in enumerate(nearest, 1)
     ]
-    width = max((len(row["name"]) for row in rows), default=4)
-    print(f"{'rank':>4}  {'distance':>9}  {'body':<{width}}  class")
-    for row in rows:
-        print(
-            f"{row['rank']:>4}  {row['distance']:>9.3g}  {row['name']:<{width}}  {row['class'] or '-'}"
-        )
+    cells = [
+        (row["rank"], f"{row['distance']:.3g}", row["name"], row["class"] or "-") for row in rows
+    ]
+    print(text_table(("rank", "distance", "body", "class"), cells, left=("body", "class")))
     if n_missing:
         print(
             f"{n_missing} of these {len(rows)} files were moved or deleted since they were described."

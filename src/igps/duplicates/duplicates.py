@@ -5,25 +5,50 @@ Two surfaces are aligned. The distance that remains tells the same shape from an
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from itertools import islice
 from pathlib import Path
 
+import torch
 from scipy.cluster.hierarchy import DisjointSet
+from torch import Tensor
 
 from igps._parallel import on_threads
 from igps._progress import Progress
 from igps.data.dataset import Failure, SignatureDataset
 from igps.descriptors.size_and_side import Size, keeps_size
-from igps.duplicates._near_pairs import NearPairs, near_pairs, of_one_size
+from igps.duplicates._moments import distance_bounds
 from igps.duplicates.calibration import Calibration
-from igps.duplicates.grouping import Pairs, assigned, groups_of
 from igps.duplicates.surfaces import Grade, Surfaces
+from igps.mesh.mesh import millimetres
 
 _BATCH_SIZE = 256  # pairs that are aligned at once
 # Candidates are pairs whose `distance_bounds` are below this many times the limit. The bounds hold to first order only,
 # and details that cancel in a distance of surfaces do not cancel in moments: copies reached 1.3 times the limit.
 _CANDIDATE_FACTOR = 2.0
+
+_ROWS = 256  # of the matrix of bounds in memory at once
+# Bodies of one size differ by less in the logarithm of √area; levels of detail of a body differ by up to half of this
+_SIZE_TOLERANCE = 0.05
+
+NearPairs = Iterator[tuple[int, int]]  # indices i < j
+Pairs = dict[tuple[int, int], float]
+"""Distances of pairs of files, by their indices."""
+
+
+@dataclass(frozen=True)
+class Copy:
+    """Two files of one body."""
+
+    names: tuple[str, str]
+    distance: float  # of their surfaces, over √area
+    grade: Grade
+    deviation: float  # the largest, from a sample of one surface to the other, over √area
+    largest_length: float  # the same as a length
+    unit: str | None  # of the length, if known
+    is_mirrored: bool  # the files agree by a reflection alone
 
 
 @dataclass(frozen=True)
@@ -33,13 +58,7 @@ class Duplicates:
     # Sorted names of at least two files each. Every file is a copy of another file of its group, preferably the finest
     groups: tuple[tuple[str, ...], ...]
     paths: dict[str, Path]  # of the files in groups, by name
-    # The pairs that form the groups, with the distance of their surfaces over √area
-    pairs: dict[tuple[str, str], float]
-    grades: dict[tuple[str, str], Grade]  # of these pairs
-    # Largest deviation of these pairs, from a sample of one surface to the other: over √area, as a length, and the unit
-    # of the length if known
-    largest: dict[tuple[str, str], tuple[float, float, str | None]]
-    mirrored: frozenset[tuple[str, str]]  # of these pairs; the others agree without a reflection
+    copies: tuple[Copy, ...]  # the pairs that form the groups
     n_files: int  # that were compared
     failures: tuple[Failure, ...]  # files that could not be compared
 
@@ -96,30 +115,48 @@ def _graded(
 ) -> Duplicates:
     """Return the groups that the pairs form, by the names of the bodies, with the grades of the pairs."""
     names = dataset.bodies.names
-    groups = groups_of(joined)
-    grades: dict[tuple[str, str], Grade] = {}
-    largest: dict[tuple[str, str], tuple[float, float, str | None]] = {}
-    graded = on_threads(lambda pair: surfaces.grade(*pair), list(joined), work.n_workers)
-    sides = on_threads(lambda pair: surfaces.is_mirrored(*pair), list(joined), work.n_workers)
-    mirrored = frozenset(
-        (names[i], names[j])
-        for (i, j), is_mirrored in zip(joined, sides, strict=True)
-        if is_mirrored
-    )
-    for (i, j), (grade, deviation) in zip(joined, graded, strict=True):
-        pair = names[i], names[j]
+    pairs = list(joined)
+    graded = on_threads(lambda pair: surfaces.grade(*pair), pairs, work.n_workers)
+    mirrored = on_threads(lambda pair: surfaces.is_mirrored(*pair), pairs, work.n_workers)
+    copies = []
+    for (i, j), (grade, deviation), is_mirrored in zip(pairs, graded, mirrored, strict=True):
         length, unit = surfaces.length(i)
-        grades[pair] = grade
-        largest[pair] = (deviation, deviation * length, unit)
+        pair = names[i], names[j]
+        distance = joined[i, j]
+        copies.append(Copy(pair, distance, grade, deviation, deviation * length, unit, is_mirrored))
+    groups = groups_of(joined)
     return Duplicates(
         groups=tuple(tuple(names[i] for i in group) for group in groups),
         paths={names[i]: dataset.bodies.paths[i] for group in groups for i in group},
-        pairs={(names[i], names[j]): distance for (i, j), distance in joined.items()},
-        grades=grades,
-        largest=largest,
-        mirrored=mirrored,
+        copies=tuple(copies),
         n_files=len(dataset),
         failures=tuple(failures),
+    )
+
+
+def near_pairs(moments: Tensor, limit: float, progress: bool) -> NearPairs:
+    """Yield the pairs i < j of bodies whose distance may be at most the limit, by their `moments` (N, 7, 6)."""
+    with Progress(desc="compared", total=len(moments), disable=not progress) as bar:
+        for start in range(0, len(moments), _ROWS):
+            rows = moments[start : start + _ROWS]
+            with torch.inference_mode():
+                bounds = distance_bounds(rows, moments[start:])
+            for i, j in torch.nonzero(bounds <= limit).tolist():
+                if i < j:
+                    yield start + i, start + j
+            bar.update(len(rows))
+
+
+def of_one_size(near: NearPairs, dataset: SignatureDataset) -> NearPairs:
+    """Yield the pairs whose bodies have the same size."""
+
+    @cache
+    def log_length(i: int) -> float:
+        signature = dataset[i].signature
+        return math.log(signature.area) / 2 + math.log(millimetres(signature.unit))
+
+    return (
+        pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _SIZE_TOLERANCE
     )
 
 
@@ -157,3 +194,33 @@ def _regroup(joined: Pairs, surfaces: Surfaces, work: _Work) -> Pairs:
     for pairs in Progress(regrouped, desc="groups", total=len(large), disable=not work.progress):
         final |= pairs
     return final
+
+
+def assigned(members: list[int], surfaces: Surfaces, calibration: Calibration) -> Pairs:
+    """Assign the files of a group, finest first, and return the pairs of a file and the finer one that it joins.
+
+    Each file joins the nearest leader of a group that is the same; otherwise the nearest other file that is the same;
+    otherwise it is the leader of a new group.
+    """
+    leaders: list[int] = []
+    followers: list[int] = []
+    pairs: Pairs = {}
+    for i in sorted(members, key=lambda member: (surfaces.coarseness(member), member)):
+        for finer in (leaders, followers):
+            distances = [surfaces.distance(j, i, calibration) for j in finer]
+            nearest = min(distances, default=math.inf)
+            if nearest < math.inf:
+                pairs[finer[distances.index(nearest)], i] = nearest
+                followers.append(i)
+                break
+        else:
+            leaders.append(i)
+    return pairs
+
+
+def groups_of(joined: Pairs) -> list[list[int]]:
+    """Return the sorted connected components of the pairs."""
+    group = DisjointSet({i for pair in joined for i in pair})
+    for i, j in joined:
+        group.merge(i, j)
+    return sorted(sorted(members) for members in group.subsets())

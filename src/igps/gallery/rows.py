@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from igps.mesh.formats import dependencies_of, stat_key
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
+from igps.signature.signature import Signature
 
 _BATCH_SIZE = 256  # descriptions in memory at once
 
@@ -35,36 +37,27 @@ def described_rows(
 ) -> Iterator[Batch]:
     """Yield descriptions and rows of the bodies whose checksums are not `known`; append failures to the list."""
     dataset = each_body_once(dataset)
-    bodies = dataset.bodies
     with Progress(desc="descriptions", total=len(dataset), disable=not progress) as bar:
         for start in range(0, len(dataset), _BATCH_SIZE):
-            indices = range(start, min(start + _BATCH_SIZE, len(dataset)))
+            batch = dataset.subset(range(start, min(start + _BATCH_SIZE, len(dataset))))
             # Time stamps are taken before files are read: a file that changes meanwhile is described again next time
-            metadata = dict(
-                zip(
-                    indices, known_rows(bodies.subset(indices), kinds, dataset.reading), strict=True
-                )
-            )
-            checksums = {i: checksum_of(dataset, i) for i in indices}
-            new = [
-                i
-                for i in indices
-                if not checksums[i] or known.get(metadata[i]["id"]) != checksums[i]
-            ]
+            rows = known_rows(batch.bodies, kinds, dataset.reading)
+            for i, row in enumerate(rows):
+                row["checksum"] = checksum_of(batch, i)
+            new = []
+            for i, row in enumerate(rows):
+                if not row["checksum"] or known.get(row["id"]) != row["checksum"]:
+                    new.append(i)
             failed: list[Failure] = []
-            descriptions = _described(
-                dataset.subset(new), descriptor, None if strict else failed, n_workers
-            )
-            failed_names = {failure.id for failure in failed}
-            described = [i for i in new if bodies.names[i] not in failed_names]
-            if described:
-                rows = [
-                    {**metadata[i], **_measured(dataset, i), "checksum": checksums[i]}
-                    for i in described
-                ]
-                yield descriptions, rows
+            missing = batch.subset(new)
+            descriptions = _described(missing, descriptor, None if strict else failed, n_workers)
+            described = missing.usable(failed)
+            if len(described):
+                row_of = {row["name"]: row for row in rows}
+                found = zip(described.bodies.names, described.signatures(), strict=True)
+                yield descriptions, [{**row_of[name], **_measured(own)} for name, own in found]
             failures += failed
-            bar.update(len(indices))
+            bar.update(len(batch))
 
 
 def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[str, type]:
@@ -109,20 +102,17 @@ def known_rows(
 def each_body_once(dataset: SignatureDataset) -> SignatureDataset:
     """Drop bodies that are listed twice because of a symbolic link to a folder; the alphabetically first name stays."""
     bodies = dataset.bodies
-    files = list(zip(_files(bodies), bodies.parts, strict=True))
-    first = {
-        files[i]: i for i in sorted(range(len(bodies)), key=bodies.names.__getitem__, reverse=True)
-    }
-    return dataset if len(first) == len(bodies) else dataset.subset(sorted(first.values()))
+    files = zip(_files(bodies), bodies.parts, strict=True)
+    first: dict[tuple[str, str | None], int] = {}
+    for _, file, i in sorted(zip(bodies.names, files, range(len(bodies)), strict=True)):
+        first.setdefault(file, i)
+    return dataset.subset(sorted(first.values()))
 
 
 def _files(bodies: Bodies) -> list[str]:
-    folders = {
-        folder: os.path.realpath(folder)
-        for folder in {os.path.dirname(path) for path in bodies.paths}
-    }
+    resolved = cache(os.path.realpath)
     return [
-        os.path.join(folders[os.path.dirname(path)], os.path.basename(path))
+        os.path.join(resolved(os.path.dirname(path)), os.path.basename(path))
         for path in bodies.paths
     ]
 
@@ -145,8 +135,7 @@ def checksum_of(dataset: SignatureDataset, i: int) -> str:
         return ""
 
 
-def _measured(dataset: SignatureDataset, i: int) -> dict[str, Any]:
-    signature = dataset[i].signature
+def _measured(signature: Signature) -> dict[str, Any]:
     return {name: getattr(signature, name) for name in ("area", "volume", "unit")}
 
 

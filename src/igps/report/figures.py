@@ -67,8 +67,13 @@ def write_analysis(
     (out / f"{name}.json").write_text(json.dumps(finite(list(rows)), indent=2) + "\n")
     write_rows(out / f"{name}.csv", rows[0] if rows else (), (row.values() for row in rows))
     if figure is not None:
-        save_figure(figure, out / f"{name}.svg")
-        save_figure(figure, out / f"{name}.png", dpi=150)
+        save_both(figure, out / name)
+
+
+def save_both(figure: Figure, stem: Path) -> None:
+    """Save a figure as STEM.svg and STEM.png."""
+    save_figure(figure, stem.with_name(f"{stem.name}.svg"))
+    save_figure(figure, stem.with_name(f"{stem.name}.png"), dpi=150)
 
 
 def write_movement(out: Path, names: Sequence[str], movement: Movement) -> None:

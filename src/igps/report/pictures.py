@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from igps._arrays import Floats, Integers
+from igps._arrays import Floats
 from igps._parallel import run
 from igps._progress import Progress
 from igps.data.cache import Record
@@ -24,7 +24,7 @@ from igps.mesh._collapse_loops import collapse_edges
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Frame, Mesh
-from igps.mesh.surface import compact, longest_side
+from igps.mesh.surface import longest_side
 from igps.report.drawing import axes_of
 from igps.report.views import patient_views
 from igps.signature.signature import Signature
@@ -135,15 +135,15 @@ def _decoded(record: Record) -> PageSurface:
 
 
 def surface_of(mesh: Mesh, signature: Signature, n_vertices: int) -> PageSurface:
-    """Return a surface of at most `n_vertices` vertices, with the potential interpolated from surface samples."""
+    """Return a surface of `n_vertices` vertices, more if fewer would close handles, with the interpolated potential."""
     vertices = mesh.vertices
     faces = mesh.faces
     if len(vertices) > n_vertices:
         scale = longest_side(vertices)
         vertices, faces = collapse_edges(vertices / scale, faces, n_vertices)
         vertices = vertices * scale
-    if len(vertices) > n_vertices:  # fewer would close handles, which is good enough for display
-        vertices, faces = clustered(vertices, faces, n_vertices)
+    if len(vertices) > _STEPS:  # fewer would close handles; a face has two bytes for a corner
+        raise MeshError(f"{mesh.name}: too many handles to simplify its surface for the page.")
     samples = signature.surface.points
     potential = np.sqrt(
         np.square(signature.surface.eigenfunctions, dtype=np.float64) @ (1 / signature.eigenvalues)
@@ -178,31 +178,3 @@ def page_axes(mesh: Mesh, samples: Floats) -> Floats:
     if mesh.frame == "RAS":
         return patient_views()[0].axes
     return axes_of(samples)
-
-
-def clustered(vertices: Floats, faces: Integers, n_vertices: int) -> tuple[Floats, Integers]:
-    """Simplify a surface to at most `n_vertices` vertices by clustering in a grid (Rossignac and Borrel 1993).
-
-    Handles and gaps may close, so the result is suitable only for display.
-    """
-    low = vertices.min(axis=0)
-    extent = longest_side(vertices)
-    resolution = max(2, int(np.sqrt(n_vertices)))
-    while True:
-        cells = np.minimum((vertices - low) * (resolution / extent), resolution - 1).astype(
-            np.int64
-        )
-        codes = cells @ np.array([resolution**2, resolution, 1])
-        present, cell_of = np.unique(codes, return_inverse=True)
-        if len(present) <= n_vertices or resolution == 1:
-            break
-        resolution = max(1, int(0.93 * resolution))
-    counts = np.bincount(cell_of)
-    means = np.stack(
-        [np.bincount(cell_of, vertices[:, axis]) / counts for axis in range(3)], axis=1
-    )
-    clusters = cell_of[faces]
-    # Without collapsed faces
-    clusters = clusters[(clusters != np.roll(clusters, 1, axis=1)).all(axis=1)]
-    _, first = np.unique(np.sort(clusters, axis=1), axis=0, return_index=True)
-    return compact(means, clusters[np.sort(first)])

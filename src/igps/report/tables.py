@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,6 +51,22 @@ def write_rows(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]])
         csv.writer(file).writerows(chain([header, first], rows))
 
 
+def text_table(
+    titles: Sequence[str], rows: Iterable[Sequence[object]], left: Collection[str] = ()
+) -> str:
+    """Return a table for a terminal. Columns are aligned right, those with the titles `left` on the left."""
+    cells = [list(titles), *([str(cell) for cell in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = []
+    for row in cells:
+        padded = [
+            cell.ljust(width) if title in left else cell.rjust(width)
+            for cell, width, title in zip(row, widths, titles, strict=True)
+        ]
+        lines.append("  ".join(padded).rstrip())
+    return "\n".join(lines)
+
+
 def scores_table(scores: RetrievalScores) -> str:
     """Return a text table of scores in percent: one line for all queries, one per class.
 
@@ -59,21 +75,15 @@ def scores_table(scores: RetrievalScores) -> str:
     if scores.has_single_answers:
         found = scores.single_answers()
         cells = [score_cell(name, found[name]) for name in PAIR_TITLES]
-        lines = ["".join(f"{cell:>12}" for cell in row) for row in (PAIR_TITLES.values(), cells)]
+        table = text_table(list(PAIR_TITLES.values()), [cells])
         of_queries = "each with one body of its class among those that it asks"
-        lines.append(f"percent, {scores.n_queries} queries, {of_queries}; mAP: mean of 1/rank")
-        return "\n".join(lines)
-    columns = {name: title for name, title in TITLES.items() if name in scores.mean()}
-    rows = {
-        "all": scores.mean(),
-        **{str(label): values for label, values in scores.per_class().items()},
-    }
-    width = max(len(name) for name in rows)
-    lines = [" " * width + "".join(f"{title:>10}" for title in columns.values())]
-    lines += [
-        f"{name:<{width}}" + "".join(f"{100 * row[key]:>10.1f}" for key in columns)
-        for name, row in rows.items()
+        return f"{table}\npercent, {scores.n_queries} queries, {of_queries}; mAP: mean of 1/rank"
+    names = [name for name in TITLES if name in scores.mean()]
+    by_class = {"all": scores.mean(), **scores.per_class()}
+    rows = [
+        [label, *(score_cell(name, row[name]) for name in names)] for label, row in by_class.items()
     ]
+    lines = [text_table(["", *(TITLES[name] for name in names)], rows, left=[""])]
     others = "all others" if scores.adr_self is not None else "all that are no queries"
     lines.append(f"percent, {scores.n_queries} queries, each against {others}")
     if scores.n_excluded:
@@ -90,24 +100,41 @@ def score_cell(name: str, value: float | None) -> str:
     return f"{value:.0f}" if name == "median_rank" else f"{100 * value:.1f}"
 
 
+def plain_table(rows: Mapping[str, RetrievalScores], descriptor: str, own: RetrievalScores) -> str:
+    """Return a table of what plain numbers find, and a sentence on which of them are ahead of a descriptor in FT."""
+    if not rows:
+        return ""
+    names = ("nn", "map") if own.has_single_answers else ("nn", "ft", "dcg")
+    means = {name: scores.mean() for name, scores in rows.items()}
+    cells = [
+        [row, *(score_cell(name, mean[name]) for name in names)] for row, mean in means.items()
+    ]
+    lines = [f"plain numbers beside {descriptor}, percent"]
+    lines.append(text_table(["", *(TITLES[name] for name in names)], cells, left=[""]))
+    ahead = [name for name, mean in means.items() if mean["ft"] >= own.mean()["ft"]]
+    if ahead:
+        lines.append(
+            f"{', '.join(ahead)} find these classes as well as {descriptor} or better: the classes differ in plain "
+            "numbers, and the result says little about form"
+        )
+    return "\n".join(lines)
+
+
 def comparison_table(results: Sequence[Result]) -> str:
     """Return a text table with one line per descriptor: scores in percent, meshes described, seconds per mesh."""
-    rows = [result.row() for result in results]
-    width = max(len(row["descriptor"]) for row in rows)
-    lines = [
-        " " * width + "".join(f"{title:>10}" for title in (*TITLES.values(), "meshes", "s/mesh"))
-    ]
-    for row in rows:
-        scores = "".join(f"{score_cell(key, row[key]):>10}" for key in TITLES)
-        seconds = "–" if row["seconds_per_mesh"] is None else f"{row['seconds_per_mesh']:.3f}"
-        lines.append(f"{row['descriptor']:<{width}}{scores}{row['n_models']:>10}{seconds:>10}")
+    table = []
+    for result in results:
+        row = result.row()
+        seconds = row["seconds_per_mesh"]
+        shown = "–" if seconds is None else f"{seconds:.3f}"
+        scores = [score_cell(name, row[name]) for name in TITLES]
+        table.append([row["descriptor"], *scores, row["n_models"], shown])
+    lines = [text_table(["", *TITLES.values(), "meshes", "s/mesh"], table, left=[""])]
     lines.append("scores in percent, each mesh against all others that the descriptor describes")
     lines.append("s/mesh: mean processor time of a description, without that of the signature")
-    lines += [
-        f"{result.descriptor.name}: no scores: {result.error}"
-        for result in results
-        if result.error is not None
-    ]
+    for result in results:
+        if result.error is not None:
+            lines.append(f"{result.descriptor.name}: no scores: {result.error}")
     return "\n".join(lines)
 
 
@@ -118,51 +145,46 @@ def findings_table(findings: Sequence[Finding]) -> str:
     of volumes, the table also shows voxels, pieces, and the thickness of the thinnest part in voxels.
     """
     listed = [finding for finding in findings if not finding.summary]
-    width = max((len(finding.id) for finding in listed), default=0)
-    has_voxels = any(finding.voxels for finding in findings)
-    header = f"{'voxels':>10}{'pieces':>8}{'thinnest':>10}" if has_voxels else ""
-    costs = f"{'vertices':>10}{'after':>9}{'seconds':>9}{'MB':>7}"
-    lines = [f"{'':<{width}}{header}{costs}  {'unit':<12}  remarks"]
+    of_voxels = ["voxels", "pieces", "thinnest"] if any(one.voxels for one in findings) else []
+    titles = ["", *of_voxels, "vertices", "after", "seconds", "MB", "unit", "remarks"]
+    rows: list[list[object]] = []
     for finding in listed:
-        voxels = "{:>10}{:>8}{:>10}".format(*_voxel_counts(finding)) if has_voxels else ""
-        start = f"{finding.id:<{width}}{voxels}"
+        voxels = finding.voxels
+        row: list[object] = [finding.id, *[""] * len(of_voxels)]
+        if voxels is not None:
+            row[1:] = [voxels.n_voxels, voxels.n_pieces, voxels.thinnest]
         if finding.error is not None:
-            lines.append(f"{start}  cannot be used: {finding.error}")
+            rows.append([*row, "", "", "", "", "", f"cannot be used: {finding.error}"])
             continue
-        cost = f"{finding.seconds or 0:>9.1f}{(finding.memory or 0) / 1e6:>7.0f}"
+        megabytes = f"{(finding.memory or 0) / 1e6:.0f}"
+        cost = [f"{finding.seconds or 0:.1f}", megabytes]
         unit = f"{finding.unit} ({finding.unit_from})" if finding.unit else "none"
         remarks = "; ".join(finding.remarks) or "none"
-        sizes = f"{finding.n_vertices:>10}{finding.n_vertices_after:>9}"
-        lines.append(f"{start}{sizes}{cost}  {unit:<12}  {remarks}")
+        rows.append([*row, finding.n_vertices, finding.n_vertices_after, *cost, unit, remarks])
     n_bad = sum(finding.error is not None for finding in listed)
     n_repaired = sum(bool(finding.steps) for finding in findings)
     minutes = sum(finding.seconds or 0 for finding in findings) / 60
     total = f"{counted(len(findings), 'body')}: {n_repaired} repaired, {n_bad} cannot be used"
+    lines = [text_table(titles, rows, left=["", "unit", "remarks"])]
     lines.append(f"{total}; about {minutes:.1f} core-minutes")
     nothing = left_out(finding.summary for finding in findings)
     return "\n".join([*lines, nothing] if nothing else lines)
 
 
-def _voxel_counts(finding: Finding) -> tuple[object, ...]:
-    voxels = finding.voxels
-    return ("", "", "") if voxels is None else (voxels.n_voxels, voxels.n_pieces, voxels.thinnest)
-
-
 def groups_table(tests: Sequence[GroupTest]) -> str:
     """Return a text table with one line per body: p-values and q-values, effect, area under the curve, group sizes."""
-    width = max(len("body"), *(len(test.body) for test in tests))
-    row = "{:>13}{:>13}{:>10}{:>10}{:>8}{:>17}{:>7}  {}".format
     titles = ("PERMANOVA p", "PERMANOVA q", "kernel p", "kernel q", "effect", "95 %", "AUC", "n")
-    lines = [f"{'body':<{width}}" + row(*titles)]
+    rows = []
     for test in tests:
         sizes = ", ".join(f"{count} {name}" for name, count in test.sizes.items())
         if test.refused is not None:
-            lines.append(f"{test.body:<{width}}  not tested ({sizes}): {test.refused}")
+            rows.append([test.body, *[""] * 7, f"not tested ({sizes}): {test.refused}"])
             continue
         numbers = (test.permanova_p, test.permanova_q, test.kernel_p, test.kernel_q)
-        cells = [*(f"{p:.4f}" for p in numbers), f"{test.effect:.3f}"]
-        cells += [f"{test.effect_low:.3f} to {test.effect_high:.3f}", f"{test.auc:.2f}", sizes]
-        lines.append(f"{test.body:<{width}}" + row(*cells))
+        interval = f"{test.effect_low:.3f} to {test.effect_high:.3f}"
+        cells = [*(f"{p:.4f}" for p in numbers), f"{test.effect:.3f}", interval]
+        rows.append([test.body, *cells, f"{test.auc:.2f}", sizes])
+    lines = [text_table(("body", *titles), rows, left=("body", "n"))]
     lines.append(
         "p: by permutation; q: false discovery rate over the bodies; effect: share of squared distances; n: bodies"
     )

@@ -139,8 +139,8 @@ def _columns(content: bytes, at: int, element: _Element) -> tuple[Columns, int]:
             own.append(numbers)
     columns = {}
     for known, own in zip(element.properties, parts, strict=True):
-        numbers = np.array(list(chain.from_iterable(own)), known.type)
-        columns[known.name] = Column(numbers, np.array([len(row) for row in own]))
+        laid_out = np.array(list(chain.from_iterable(own)), known.type)
+        columns[known.name] = Column(laid_out, np.array([len(numbers) for numbers in own]))
     return columns, at
 
 
