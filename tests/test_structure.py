@@ -118,7 +118,7 @@ def test_nobody_enters_by_the_front_door():
 
 
 def test_a_wrong_arrow_would_be_seen(tmp_path):
-    source = "from igps.cli.demo import demo\nimport igps.nn.axes as axes\nfrom igps import data\nimport numpy\n"
+    source = "from igps.cli import main\nimport igps.nn.axes as axes\nfrom igps import data\nimport numpy\n"
     (tmp_path / "room.py").write_text(source)
     assert imported_rooms(tmp_path / "room.py") == {"cli", "nn", "data"}
 

@@ -36,7 +36,7 @@ from igps.duplicates.calibration import (
     Threshold,
     calibration_params,
 )
-from igps.duplicates.surfaces import Surfaces, distance_if_alike
+from igps.duplicates.compared_surfaces import Surfaces, distance_if_alike
 from igps.mesh.mesh import Mesh
 from igps.nn.description import describe
 from training.disturbances import move, remesh, scale, simplified

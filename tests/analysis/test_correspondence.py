@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial.distance import mahalanobis
 
 from conftest import as_mesh
-from igps.analysis.correspondence import local_shape, squared_deviations
+from igps.analysis.dissimilarity import local_shape, squared_deviations
 from igps.data.collation import collate
 from igps.signature.signature import SignatureConfig, compute_signature
 

@@ -15,7 +15,7 @@ from igps.analysis.clusters import clusters_of
 from igps.analysis.groups import group_test
 from igps.analysis.map import body_map
 from igps.analysis.outliers import LIMIT
-from igps.cli.explain import _extent
+from igps.cli.explain_command import _extent
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
 from igps.report.figures import clusters_figure, map_figure, write_analysis

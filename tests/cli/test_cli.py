@@ -155,7 +155,7 @@ def test_results_are_written_though_nobody_reads_what_is_printed(root, tmp_path,
     def gone(*words):
         raise BrokenPipeError
 
-    monkeypatch.setattr("igps.cli.retrieval.print", gone, raising=False)
+    monkeypatch.setattr("igps.cli.retrieval_commands.print", gone, raising=False)
     with pytest.raises(SystemExit):
         run(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", tmp_path / "out", *SMALL)
     assert (tmp_path / "out" / "scores.json").exists()

@@ -13,8 +13,8 @@ import pytest
 import igps
 from commands import error_of, run
 from igps.cli.commands import COMMANDS, load_command
-from igps.cli.options import COMMON, SHARED
 from igps.cli.parsing import parse
+from igps.cli.shared_options import COMMON, SHARED
 from igps.mesh.options import LoadOptions
 from igps.signature.config import SignatureConfig
 

@@ -13,7 +13,7 @@ import pytest
 from bodies_on_disk import write_body
 
 from commands import run
-from igps.cli.precompute import dask_executor, of_shard
+from igps.cli.precompute_command import dask_executor, of_shard
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import fill_elsewhere
 from igps.failures import MachineError

@@ -12,10 +12,10 @@ from torch.testing import assert_close
 
 import igps
 from igps import Mesh, SignatureConfig, collate, compute_signature
-from igps.cli.compare import compare
-from igps.cli.duplicates import duplicates as list_duplicates
-from igps.cli.gallery import build
-from igps.cli.retrieval import query, retrieve
+from igps.cli.compare_command import compare
+from igps.cli.duplicates_command import duplicates as list_duplicates
+from igps.cli.gallery_commands import build
+from igps.cli.retrieval_commands import query, retrieve
 from igps.descriptors.fingerprint import cache_tag
 from igps.descriptors.size_and_side import SCALES, SizeAndSide, keeps_size, signed_volumes
 from igps.duplicates.duplicates import duplicates

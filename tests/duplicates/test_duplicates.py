@@ -21,8 +21,8 @@ from igps.cli.commands import COMMANDS
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.duplicates.calibration import Calibration
+from igps.duplicates.compared_surfaces import Surfaces
 from igps.duplicates.duplicates import assigned, duplicates
-from igps.duplicates.surfaces import Surfaces
 from igps.signature.signature import SignatureConfig
 
 PROJECT = Path(__file__).parents[2]

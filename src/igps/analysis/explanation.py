@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from igps._arrays import Floats
-from igps.analysis.correspondence import dissimilarity
+from igps.analysis.dissimilarity import dissimilarity
 from igps.analysis.superposition import Movement
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.data.collation import collate

@@ -17,8 +17,8 @@ from typing import Any
 
 from igps._parameters import check_at_least
 from igps.cli.commands import COMMANDS, ENDINGS, Command
-from igps.cli.options import JSON, WITH, Verdict
 from igps.cli.parsing import parse
+from igps.cli.shared_options import JSON, WITH, Verdict
 
 
 @contextlib.contextmanager

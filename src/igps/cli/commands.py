@@ -11,33 +11,33 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from igps.cli.options import GROUPS, JSON, MEANINGS, SHARED, SIGNATURE, WITH, Option
+from igps.cli.shared_options import GROUPS, JSON, MEANINGS, SHARED, SIGNATURE, WITH, Option
 
 COMMANDS: Mapping[str, str] = {
-    "retrieve": "igps.cli.retrieval:retrieve",
-    "query": "igps.cli.retrieval:query",
-    "extract": "igps.cli.retrieval:extract",
-    "compare": "igps.cli.compare:compare",
-    "fit": "igps.cli.fit:fit",
-    "classify": "igps.cli.fit:classify",
-    "train": "igps.cli.train:train",
-    "inside": "igps.cli.inside:inside",
-    "groups": "igps.cli.groups:groups",
-    "explain": "igps.cli.explain:explain",
-    "outliers": "igps.cli.outliers:outliers",
-    "asymmetry": "igps.cli.asymmetry:asymmetry",
-    "clusters": "igps.cli.clusters:clusters",
-    "trajectory": "igps.cli.trajectory:trajectory",
-    "duplicates": "igps.cli.duplicates:duplicates",
-    "doctor": "igps.cli.doctor:doctor",
-    "report": "igps.cli.report:report",
-    "gallery build": "igps.cli.gallery:build",
-    "gallery sync": "igps.cli.gallery:sync",
-    "gallery remove": "igps.cli.gallery:remove",
-    "gallery info": "igps.cli.gallery:info",
-    "precompute": "igps.cli.precompute:precompute",
-    "demo": "igps.cli.demo:demo",
-    "help": "igps.cli.help:show_help",
+    "retrieve": "igps.cli.retrieval_commands:retrieve",
+    "query": "igps.cli.retrieval_commands:query",
+    "extract": "igps.cli.retrieval_commands:extract",
+    "compare": "igps.cli.compare_command:compare",
+    "fit": "igps.cli.fit_commands:fit",
+    "classify": "igps.cli.fit_commands:classify",
+    "train": "igps.cli.train_command:train",
+    "inside": "igps.cli.inside_command:inside",
+    "groups": "igps.cli.groups_command:groups",
+    "explain": "igps.cli.explain_command:explain",
+    "outliers": "igps.cli.outliers_command:outliers",
+    "asymmetry": "igps.cli.asymmetry_command:asymmetry",
+    "clusters": "igps.cli.clusters_command:clusters",
+    "trajectory": "igps.cli.trajectory_command:trajectory",
+    "duplicates": "igps.cli.duplicates_command:duplicates",
+    "doctor": "igps.cli.doctor_command:doctor",
+    "report": "igps.cli.report_command:report",
+    "gallery build": "igps.cli.gallery_commands:build",
+    "gallery sync": "igps.cli.gallery_commands:sync",
+    "gallery remove": "igps.cli.gallery_commands:remove",
+    "gallery info": "igps.cli.gallery_commands:info",
+    "precompute": "igps.cli.precompute_command:precompute",
+    "demo": "igps.cli.demo_command:demo",
+    "help": "igps.cli.help_command:show_help",
 }
 """Where the function of each command is. Its module imports other packages inside its functions, see `Command`."""
 

@@ -17,7 +17,7 @@ from igps.cli.commands import (
     kinds_of,
     load_command,
 )
-from igps.cli.options import COMMON, OPTIONS, SHARED, SIGNATURE, Option
+from igps.cli.shared_options import COMMON, OPTIONS, SHARED, SIGNATURE, Option
 
 SUMMARY = "Volumetric shape retrieval by interior Global Point Signatures."
 _MORE = (

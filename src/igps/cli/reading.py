@@ -14,7 +14,7 @@ from torch import Tensor
 
 from igps._arrays import Floats, Singles
 from igps._text import counted
-from igps.cli.options import ClassRule, Mirror, Size, limits_of
+from igps.cli.shared_options import ClassRule, Mirror, Size, limits_of
 from igps.data.attribute_sources import attribute_sources
 from igps.data.cache import default_cache_dir
 from igps.data.dataset import Failure, SignatureDataset
@@ -89,7 +89,7 @@ def signatures(
         source: bodies.
         descriptors: descriptors whose requirements the signatures must meet.
         strict, n_workers, time_limit, memory_limit, complete, collection: options of every command that reads bodies,
-            see `igps.cli.options.GROUPS`.
+            see `igps.cli.shared_options.GROUPS`.
 
     Returns:
         The bodies whose signatures are in the cache, and the failures of the others.

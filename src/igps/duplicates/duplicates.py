@@ -1,7 +1,7 @@
 """Files that show the same body, whatever its scale, mirror image, triangulation, level of detail or file format.
 
 Two surfaces are aligned. The distance that remains tells the same shape from another pose and from a similar body (see
-`igps.duplicates.surfaces`). Only candidate pairs are aligned: those whose moments allow a small distance.
+`igps.duplicates.compared_surfaces`). Only candidate pairs are aligned: those whose moments allow a small distance.
 """
 
 import math
@@ -21,7 +21,7 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.descriptors.size_and_side import Size, keeps_size
 from igps.duplicates._moments import distance_bounds
 from igps.duplicates.calibration import Calibration
-from igps.duplicates.surfaces import Grade, Surfaces
+from igps.duplicates.compared_surfaces import Grade, Surfaces
 from igps.mesh.mesh import millimetres
 
 _BATCH_SIZE = 256  # pairs that are aligned at once

@@ -47,8 +47,8 @@ def retrieve(
     """
     from igps.analysis.comparison import pair_distances
     from igps.cli.reading import Folder, described, print_failures
-    from igps.cli.report import check_report_folder
-    from igps.cli.report import report as write_report
+    from igps.cli.report_command import check_report_folder
+    from igps.cli.report_command import report as write_report
     from igps.retrieval import rerank as reranked_distances
 
     check_report_folder(report, out)
@@ -218,7 +218,7 @@ def query(
         rerank: re-rank the nearest 200 bodies by their common neighbours (k-reciprocal, without labels);
             the listed distances are the re-ranked ones.
     """
-    from igps.cli.gallery import gallery_options
+    from igps.cli.gallery_commands import gallery_options
     from igps.cli.reading import Folder, check_files, described
     from igps.gallery.gallery import Gallery
     from igps.gallery.opening import is_gallery

@@ -13,9 +13,9 @@ def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[s
         out: folder for the meshes, the results of igps retrieve and of igps clusters, and report.html.
         n_workers: number of worker processes; by default one for each core.
     """
-    from igps.cli.clusters import clusters
-    from igps.cli.report import report
-    from igps.cli.retrieval import retrieve
+    from igps.cli.clusters_command import clusters
+    from igps.cli.report_command import report
+    from igps.cli.retrieval_commands import retrieve
     from igps.shapes import ArticulatedShapes
 
     shapes = ArticulatedShapes(n_classes=8, n_per_class=10)

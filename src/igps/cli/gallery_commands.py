@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from igps._text import counted
-from igps.cli.options import Mirror, Size
+from igps.cli.shared_options import Mirror, Size
 from igps.mesh.options import LoadOptions
 from igps.signature.config import SignatureConfig
 

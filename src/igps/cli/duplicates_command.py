@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from igps._text import counted
-from igps.cli.options import Size
+from igps.cli.shared_options import Size
 
 if TYPE_CHECKING:
     from igps.duplicates.duplicates import Duplicates

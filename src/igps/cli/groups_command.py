@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from igps._parameters import check_at_least, check_seed
-from igps.cli.options import Size
+from igps.cli.shared_options import Size
 
 if TYPE_CHECKING:
     from igps.analysis.groups import GroupTest
@@ -53,7 +53,7 @@ def groups(
 
     from igps._progress import Progress
     from igps.analysis.groups import group_test, with_q_values
-    from igps.cli.inside import check_has_attribute, inside_vectors
+    from igps.cli.inside_command import check_has_attribute, inside_vectors
     from igps.cli.reading import Folder, described, print_failures
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import keeps_size

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from igps.cli.options import Verdict, limits_of
+from igps.cli.shared_options import Verdict, limits_of
 from igps.mesh.options import LoadOptions
 from igps.signature.config import SignatureConfig
 

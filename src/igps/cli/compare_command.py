@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from igps._text import counted
-from igps.cli.options import Mirror, Size
+from igps.cli.shared_options import Mirror, Size
 
 if TYPE_CHECKING:
     from igps.analysis.comparison import Result
@@ -45,8 +45,8 @@ def compare(
     from igps.analysis.comparison import compare as compare_descriptors
     from igps.analysis.plain_numbers import plain_scores
     from igps.cli.reading import Folder, signatures, with_side, with_size, write_mending_notes
-    from igps.cli.report import check_report_folder
-    from igps.cli.report import report as write_report
+    from igps.cli.report_command import check_report_folder
+    from igps.cli.report_command import report as write_report
     from igps.descriptors import NAMES
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import SIZE

@@ -38,8 +38,8 @@ def precompute(
         shard: part of the meshes for one job of a batch system, such as 3/64, the third of 64 parts.
         failures: CSV file for the meshes that cannot be used.
     """
-    from igps.cli.options import limits_of
     from igps.cli.reading import Folder, dataset_from_options
+    from igps.cli.shared_options import limits_of
     from igps.descriptors import descriptor as descriptor_of
     from igps.report.tables import write_rows
 
