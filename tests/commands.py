@@ -7,15 +7,16 @@ import pytest
 from igps.cli import main
 
 
-def run(monkeypatch, *arguments):
+def run(*arguments):
     """Run `igps` with arguments."""
-    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
-    main()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["igps", *map(str, arguments)])
+        main()
 
 
-def error_of(monkeypatch, capsys, *arguments):
+def error_of(capsys, *arguments):
     """Return the line of the error with which `igps` ends for these arguments."""
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, *arguments)
+        run(*arguments)
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
     return line

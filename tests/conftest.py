@@ -55,6 +55,20 @@ def trust_recent_files(monkeypatch):
 
 
 @pytest.fixture
+def here(tmp_path):
+    """The folder of the test as the current one."""
+    with contextlib.chdir(tmp_path):
+        yield tmp_path
+
+
+@pytest.fixture
+def here(tmp_path):
+    """The folder of the test as the current one."""
+    with contextlib.chdir(tmp_path):
+        yield tmp_path
+
+
+@pytest.fixture
 def on_path(tmp_path, monkeypatch):
     """A folder on the Python path."""
     monkeypatch.syspath_prepend(tmp_path)

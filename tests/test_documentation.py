@@ -75,10 +75,9 @@ def shared_cache(tmp_path_factory):
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch, shared_cache):
+def folder(tmp_path, here, monkeypatch, shared_cache):
     """The current folder, on the path of Python, whose cache is shared. What is imported from it is forgotten."""
     (tmp_path / "cache").symlink_to(shared_cache)
-    monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     before = set(sys.modules)
     yield tmp_path
@@ -179,7 +178,7 @@ def test_the_ten_lines_print_scores_and_the_nearest(folder, capsys):
     assert expected[0] == dataset.bodies.names[0]
 
 
-def test_the_descriptor_of_ones_own_runs_by_its_place(folder, monkeypatch):
+def test_the_descriptor_of_ones_own_runs_by_its_place(folder):
     page = python("docs/how-to/add-descriptor.md")
     (mine,) = [block for block in page if block.title == "mine.py"]
     (folder / "mine.py").write_text(mine.text)
@@ -187,7 +186,7 @@ def test_the_descriptor_of_ones_own_runs_by_its_place(folder, monkeypatch):
     options = ["--signature.n_eigenpairs", "5", "--n_workers", "1"]
     options += ["--cache_dir", "cache", "--out", "out"]
     words = ["retrieve", "shapes", "--descriptor", "mine:Roundness", *options]
-    commands.run(monkeypatch, *words)
+    commands.run(*words)
     with np.load(folder / "out" / "distances.npz") as archive:
         distances = archive["distances"]
         names = archive["names"]
@@ -328,9 +327,9 @@ def commands_told():
 
 
 @pytest.mark.parametrize(("command", "lines"), commands_told().items())
-def test_what_igps_is_told_exists(command, lines, monkeypatch, capsys):
+def test_what_igps_is_told_exists(command, lines, capsys):
     with pytest.raises(SystemExit, match="0"):
-        commands.run(monkeypatch, *command.split(), "--help")
+        commands.run(*command.split(), "--help")
     text = capsys.readouterr().out
     shared = load_command(command).shared_options()
     for line, words in lines:

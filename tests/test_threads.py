@@ -329,7 +329,7 @@ def test_a_command_leaves_the_settings(monkeypatch, capsys):
 
     monkeypatch.setattr("igps.cli.reading.find_bodies", watched)
     with pytest.raises(SystemExit):
-        run(monkeypatch, "retrieve", "nowhere")
+        run("retrieve", "nowhere")
     assert "no meshes" in capsys.readouterr().err
     assert seen == [1]
     assert settings() == before

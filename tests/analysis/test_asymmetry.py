@@ -90,7 +90,7 @@ def test_the_odd_pair_comes_first_and_cut_ones_are_not_judged():
     assert last.score is None
 
 
-def test_the_command_finds_the_subject_whose_kidney_is_flat(tmp_path, monkeypatch, capsys):
+def test_the_command_finds_the_subject_whose_kidney_is_flat(tmp_path, capsys):
     """Six subjects; a right kidney is the mirror image of the left one, but for a few percent of each axis."""
     x, y, z = np.indices((20, 20, 24)) - np.array([9.5, 9.5, 11.5]).reshape(3, 1, 1, 1)
     random = np.random.default_rng(0)
@@ -110,7 +110,7 @@ def test_the_command_finds_the_subject_whose_kidney_is_flat(tmp_path, monkeypatc
     words = ["--descriptor", "own_descriptors:small_interior", "--cache_dir", tmp_path / "cache"]
     words += ["--signature.n_eigenpairs", 20, "--n_workers", 1]
     named = ["--names", "totalsegmentator"]
-    run(monkeypatch, "asymmetry", folder, "--out", tmp_path / "out", *named, *words)
+    run("asymmetry", folder, "--out", tmp_path / "out", *named, *words)
     table = pd.read_csv(tmp_path / "out" / "asymmetry.csv")
     assert table["subject"][0] == "s4.nii.gz"
     assert table["form_score"][0] > 2 > table["form_score"][1:].max()
@@ -119,5 +119,5 @@ def test_the_command_finds_the_subject_whose_kidney_is_flat(tmp_path, monkeypatc
     assert table["form"][1:].max() < 0.3 * table["form"][0]
     assert set(table["structure"]) == {"kidney"}
     assert "s4.nii.gz kidney" in capsys.readouterr().out.splitlines()[1]
-    line = error_of(monkeypatch, capsys, "asymmetry", folder, *words)
+    line = error_of(capsys, "asymmetry", folder, *words)
     assert "no body has a partner on the other side by its name" in line

@@ -44,9 +44,9 @@ def root(tmp_path_factory):
     return folder
 
 
-def igps(monkeypatch, root, *arguments):
+def igps(root, *arguments):
     cache = ["--cache_dir", root.parent / "cache"]
-    run(monkeypatch, *arguments, *cache, *SMALL)
+    run(*arguments, *cache, *SMALL)
 
 
 def table(path):
@@ -54,7 +54,7 @@ def table(path):
         return list(csv.DictReader(file))
 
 
-def test_groups_prints_and_writes_the_tests(root, tmp_path, monkeypatch, capsys):
+def test_groups_prints_and_writes_the_tests(root, tmp_path, capsys):
     words = [
         "--strata",
         "scanner",
@@ -66,7 +66,7 @@ def test_groups_prints_and_writes_the_tests(root, tmp_path, monkeypatch, capsys)
         "--out",
         tmp_path,
     ]
-    igps(monkeypatch, root, "groups", root, *OWN, *words)
+    igps(root, "groups", root, *OWN, *words)
     printed = capsys.readouterr().out
     dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
     descriptions = describe(dataset, small_interior())
@@ -89,7 +89,7 @@ def test_groups_prints_and_writes_the_tests(root, tmp_path, monkeypatch, capsys)
     assert (tmp_path / "groups.svg").read_text().startswith("<?xml")
 
 
-def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(tmp_path, monkeypatch):
+def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(tmp_path):
     """Of eight subjects, the right egg is longer than the left one; only as pairs are they told apart so surely."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     place = np.indices((24, 60, 24)) - 12
@@ -106,7 +106,7 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(tmp_path,
         nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), root / f"s{i}.nii.gz")
     (root / "labels.csv").write_text("\n".join(rows))
     words = ["--group", "side", "--strata", "subject", "--out", tmp_path / "found"]
-    igps(monkeypatch, root, "groups", root, *OWN, *words)
+    igps(root, "groups", root, *OWN, *words)
     (found,) = json.loads((tmp_path / "found" / "groups.json").read_text())
     assert found["body"] == "all"
     assert found["sizes"] == "left:8 right:8"
@@ -116,7 +116,7 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(tmp_path,
 
 
 @pytest.mark.parametrize("name", ["{group}{i}", "{i}", "case_{i}", "{word}"])
-def test_single_masks_in_a_folder_for_each_group_are_compared(name, tmp_path, monkeypatch):
+def test_single_masks_in_a_folder_for_each_group_are_compared(name, tmp_path):
     """Masks named by their files count as one body; volumes of the groups do not overlap, so p is nearly minimal."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     place = np.indices((24, 24, 24)) - 12
@@ -130,7 +130,7 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(name, tmp_path, mo
             path = folder / f"{name.format(group=group, i=i, word=word)}.nii.gz"
             nibabel.save(nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)), path)
     words = ["--test_size", "--out", tmp_path / "found"]
-    igps(monkeypatch, tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
+    igps(tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
     _, size = json.loads((tmp_path / "found" / "groups.json").read_text())
     assert size["body"] == "all, size"
     assert size["sizes"] == "controls:5 patients:5"
@@ -139,7 +139,7 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(name, tmp_path, mo
     )  # of the 252 ways to draw five of ten, this one and its mirror
 
 
-def test_volumes_are_compared_in_one_unit(tmp_path, monkeypatch, capsys):
+def test_volumes_are_compared_in_one_unit(tmp_path, capsys):
     """Half of the eggs of each group are in metres."""
     root = tmp_path / "eggs"
     heights = {"low": (1.0, 1.02, 1.04, 1.06, 1.08), "high": (2.0, 2.02, 2.04, 2.06, 2.08)}
@@ -149,20 +149,20 @@ def test_volumes_are_compared_in_one_unit(tmp_path, monkeypatch, capsys):
             if i % 2:
                 trimesh.load(path, process=False).apply_scale(1e-3).export(path.with_suffix(".glb"))
                 path.unlink()
-    igps(monkeypatch, root, "groups", root, *OWN, "--test_size", "--out", tmp_path)
+    igps(root, "groups", root, *OWN, "--test_size", "--out", tmp_path)
     assert (
         "6 of 10 bodies have no unit of length; their coordinates are taken as millimetres"
         in capsys.readouterr().out
     )
     assert float(table(tmp_path / "groups.csv")[1]["effect"]) > 0.9
-    igps(monkeypatch, root, "clusters", root, *OWN, "--colour", "volume", "--out", tmp_path)
+    igps(root, "clusters", root, *OWN, "--colour", "volume", "--out", tmp_path)
     found = {row["name"][:-4]: float(row["volume"]) for row in table(tmp_path / "clusters.csv")}
     for label, of_each in heights.items():
         for i, height in enumerate(of_each):
             assert found[f"{label}/{i}"] == pytest.approx(found["low/0"] * height, rel=1e-5)
 
 
-def test_a_covariate_may_be_words_but_no_mistyped_number(root, tmp_path, monkeypatch, capsys):
+def test_a_covariate_may_be_words_but_no_mistyped_number(root, tmp_path, capsys):
     rows = table(root / "labels.csv")
     lines = [
         f"{root / row['file']},{row['label']},{'fmm'[i % 3]},{'5o' if i == 4 else i},{'Paris' if i % 3 else 'Nantes'}"
@@ -170,7 +170,7 @@ def test_a_covariate_may_be_words_but_no_mistyped_number(root, tmp_path, monkeyp
     ]
     (tmp_path / "labels.csv").write_text("\n".join(["file,label,sex,dose,site", *lines]))
     words = ["groups", tmp_path, *OWN, "--n_permutations", "199"]
-    igps(monkeypatch, root, *words, "--covariate", "sex", "--json")
+    igps(root, *words, "--covariate", "sex", "--json")
     (found,) = json.loads(capsys.readouterr().out)
     descriptions = describe(SignatureDataset(root, CONFIG, root.parent / "cache"), small_interior())
     vectors = descriptions.flatten(1).double().sqrt().numpy()
@@ -181,27 +181,27 @@ def test_a_covariate_may_be_words_but_no_mistyped_number(root, tmp_path, monkeyp
     assert found["permanova_f"] == pytest.approx(expected.permanova_f)
     assert found["permanova_p"] == expected.permanova_p
     # A word that begins as NaN does
-    igps(monkeypatch, root, *words, "--covariate", "site", "--json")
+    igps(root, *words, "--covariate", "site", "--json")
     assert json.loads(capsys.readouterr().out)[0]["permanova_f"] == pytest.approx(
         expected.permanova_f
     )
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, root, *words, "--covariate", "dose")
+        igps(root, *words, "--covariate", "dose")
     assert "dose: expected numbers, got '5o'" in capsys.readouterr().err
 
 
-def test_covariates_that_are_named_one_by_one_all_count(root, monkeypatch, capsys):
+def test_covariates_that_are_named_one_by_one_all_count(root, capsys):
     found = []
     for words in (
         ["--covariate", "age", "scanner"],
         ["--covariate", "age", "--covariate", "scanner"],
     ):
-        igps(monkeypatch, root, "groups", root, *OWN, *words, "--n_permutations", "99", "--json")
+        igps(root, "groups", root, *OWN, *words, "--n_permutations", "99", "--json")
         found.append(json.loads(capsys.readouterr().out))
     assert found[0] == found[1]
 
 
-def test_groups_refuses_three_of_a_group(root, tmp_path, monkeypatch, capsys):
+def test_groups_refuses_three_of_a_group(root, tmp_path, capsys):
     rows = table(root / "labels.csv")
     (tmp_path / "labels.csv").write_text(
         "file,ill\n"
@@ -209,7 +209,7 @@ def test_groups_refuses_three_of_a_group(root, tmp_path, monkeypatch, capsys):
             f"{root / row['file']},{'yes' if i < 3 else 'no'}\n" for i, row in enumerate(rows)
         )
     )
-    igps(monkeypatch, root, "groups", tmp_path, "--group", "ill", *OWN, "--out", tmp_path / "out")
+    igps(root, "groups", tmp_path, "--group", "ill", *OWN, "--out", tmp_path / "out")
     assert (
         "not tested (10 no, 3 yes): yes has 3 bodies, a test needs at least 5"
         in capsys.readouterr().out
@@ -217,8 +217,8 @@ def test_groups_refuses_three_of_a_group(root, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "out" / "groups.png").exists()
 
 
-def test_outliers_lists_the_short_egg_among_the_long_first(root, tmp_path, monkeypatch, capsys):
-    igps(monkeypatch, root, "outliers", root, *OWN, "--top", "2", "--out", tmp_path)
+def test_outliers_lists_the_short_egg_among_the_long_first(root, tmp_path, capsys):
+    igps(root, "outliers", root, *OWN, "--top", "2", "--out", tmp_path)
     printed = capsys.readouterr().out
     rows = table(tmp_path / "outliers.csv")
     assert len(rows) == 13
@@ -232,13 +232,13 @@ def test_outliers_lists_the_short_egg_among_the_long_first(root, tmp_path, monke
         (float(row["score"]) for row in rows), reverse=True
     )
     assert imread(tmp_path / "outliers.png").std() > 0.02
-    igps(monkeypatch, root, "outliers", root, *OWN, "--top", "0", "--out", tmp_path / "none")
+    igps(root, "outliers", root, *OWN, "--top", "0", "--out", tmp_path / "none")
     assert table(tmp_path / "none" / "outliers.csv") == rows
     assert not (tmp_path / "none" / "outliers.png").exists()
 
 
 @pytest.mark.parametrize("masks", [False, True])
-def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(masks, tmp_path, monkeypatch):
+def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(masks, tmp_path):
     """The labels of a file, or the masks of a folder."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     random = default_rng(0)
@@ -258,7 +258,6 @@ def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(masks, tmp_path,
             )
             nibabel.save(nibabel.Nifti1Image(voxels.astype(np.uint8), affine), path)
     igps(
-        monkeypatch,
         tmp_path / "x",
         "outliers",
         tmp_path / "scans",
@@ -275,9 +274,9 @@ def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(masks, tmp_path,
 
 
 @pytest.mark.parametrize("is_group", [False, True])
-def test_explain_writes_shares_that_add_up(is_group, root, tmp_path, monkeypatch, capsys):
+def test_explain_writes_shares_that_add_up(is_group, root, tmp_path, capsys):
     what = ["explain", root] if is_group else ["explain", root / "short0.off", root / "long3.off"]
-    igps(monkeypatch, root, *what, *OWN, "--out", tmp_path)
+    igps(root, *what, *OWN, "--out", tmp_path)
     printed = capsys.readouterr().out
     (part,) = table(tmp_path / "explain.csv")
     shares = [float(row["share"]) for row in table(tmp_path / "explain_samples.csv")]
@@ -291,7 +290,7 @@ def test_explain_writes_shares_that_add_up(is_group, root, tmp_path, monkeypatch
     assert imread(tmp_path / "explain.png").std() > 0.02
 
 
-def test_explain_paints_the_voxels_in_which_an_attribute_differs(tmp_path, monkeypatch, capsys):
+def test_explain_paints_the_voxels_in_which_an_attribute_differs(tmp_path, capsys):
     """Two equal bodies, one with a bright spot in noise: it has the share."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     affine = np.diag([1.0, 1.0, 1.5, 1.0])
@@ -310,7 +309,7 @@ def test_explain_paints_the_voxels_in_which_an_attribute_differs(tmp_path, monke
     cache = ["--cache_dir", tmp_path / "cache", *SMALL, *samples, "--size", "ignore"]
     ct = ["--attribute", f"ct={tmp_path}/{{stem}}_ct.nii.gz", "--with", "ct"]
     words = ["explain", *files, *OWN, *ct, *cache, "--out", tmp_path / "out"]
-    run(monkeypatch, *words, "--json")
+    run(*words, "--json")
     told = json.loads(capsys.readouterr().out)
     rows = table(tmp_path / "out" / "explain_ct.csv")
     shares = np.array([float(row["share"]) for row in rows])
@@ -325,7 +324,7 @@ def test_explain_paints_the_voxels_in_which_an_attribute_differs(tmp_path, monke
     assert imread(tmp_path / "out" / "explain_ct.png").std() > 0.02
 
 
-def test_explain_and_groups_paint_where_an_organ_differs(tmp_path, monkeypatch, capsys):
+def test_explain_and_groups_paint_where_an_organ_differs(tmp_path, capsys):
     """Organ 1 has a knob on the patient's left in one group; organ 2 does not differ."""
     nibabel = pytest.importorskip("nibabel")
     random = default_rng(0)
@@ -345,11 +344,11 @@ def test_explain_and_groups_paint_where_an_organ_differs(tmp_path, monkeypatch, 
     with (tmp_path / "scans" / "labels.csv").open("w", newline="") as file:
         csv.writer(file).writerows(rows)
     what = [tmp_path / "scans", *OWN, "--group", "diagnosis", "--n_workers", 1]
-    igps(monkeypatch, tmp_path, "explain", *what, "--body", "1", "--out", tmp_path / "one")
+    igps(tmp_path, "explain", *what, "--body", "1", "--out", tmp_path / "one")
     printed = capsys.readouterr().out
     assert "ill lies outside healthy by up to" in printed
     assert imread(tmp_path / "one" / "explain.png").std() > 0.02
-    igps(monkeypatch, tmp_path, "groups", *what, "--out", tmp_path / "all")
+    igps(tmp_path, "groups", *what, "--out", tmp_path / "all")
     assert (tmp_path / "all" / "places_1.png").is_file()
     assert not (tmp_path / "all" / "places_2.png").exists()
 
@@ -369,12 +368,12 @@ def test_explain_tells_how_much_of_the_surface_differs(largest, told, root, monk
     monkeypatch.setattr(
         "igps.analysis.explanation.share_density", lambda *_: np.append(np.full(161, -1.0), largest)
     )
-    igps(monkeypatch, root, "explain", root / "short0.off", root / "long3.off", *OWN)
+    igps(root, "explain", root / "short0.off", root / "long3.off", *OWN)
     assert capsys.readouterr().out.splitlines()[-1] == f"{root}/long3.off: {told}"
 
 
 @pytest.mark.parametrize("is_group", [False, True])
-def test_explain_heeds_size_and_side(is_group, root, monkeypatch, capsys):
+def test_explain_heeds_size_and_side(is_group, root, capsys):
     """Bodies that are twice as large as others of their form differ in size; the side of symmetric ones is rounding."""
     folder = root.parent / f"sized{is_group}"
     for label, factor in (("small", 1.0), ("large", 2.0)):
@@ -386,7 +385,6 @@ def test_explain_heeds_size_and_side(is_group, root, monkeypatch, capsys):
     what = [folder] if is_group else [folder / "small" / "0.off", folder / "large" / "0.off"]
     own = ["--descriptor", "own_descriptors:small_gps"]
     igps(
-        monkeypatch,
         root,
         "explain",
         *what,
@@ -407,9 +405,9 @@ def test_explain_heeds_size_and_side(is_group, root, monkeypatch, capsys):
         assert {name[-5] for name in found["bodies"]} <= set("1234")
 
 
-def test_explain_shows_the_ends_of_an_axis_of_the_map(root, tmp_path, monkeypatch, capsys):
+def test_explain_shows_the_ends_of_an_axis_of_the_map(root, tmp_path, capsys):
     """Eggs vary in their height alone: from the ball to the longest."""
-    igps(monkeypatch, root, "explain", root, *OWN, "--axis", 1, "--out", tmp_path)
+    igps(root, "explain", root, *OWN, "--axis", 1, "--out", tmp_path)
     printed = capsys.readouterr().out
     share = re.search(
         r"axis 1 of the map has (\d+)% of the squared distances of 13 bodies", printed
@@ -442,10 +440,9 @@ def test_half_of_a_share_lies_on_a_part_of_the_area_however_small_its_faces_are(
         assert percent == pytest.approx(12.5, abs=0.6)  # of two digits
 
 
-def test_clusters_are_the_two_kinds_of_eggs(root, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_clusters_are_the_two_kinds_of_eggs(root, tmp_path, here, capsys):
     out = ["--out", "figures"]
-    igps(monkeypatch, root, "clusters", root, *OWN, "--n_clusters", "2", *out)
+    igps(root, "clusters", root, *OWN, "--n_clusters", "2", *out)
     printed = capsys.readouterr().out
     rows = table(tmp_path / "figures" / "clusters.csv")
     clusters = {row["name"]: row["cluster"] for row in rows}
@@ -457,16 +454,16 @@ def test_clusters_are_the_two_kinds_of_eggs(root, tmp_path, monkeypatch, capsys)
     assert "long6.off" in (tmp_path / "figures" / "clusters.json").read_text()
 
 
-def test_a_stability_that_was_not_measured_is_unknown(root, monkeypatch, capsys):
-    igps(monkeypatch, root, "clusters", root, *OWN, "--n_clusters", "2", "--n_resamples", "0")
+def test_a_stability_that_was_not_measured_is_unknown(root, capsys):
+    igps(root, "clusters", root, *OWN, "--n_clusters", "2", "--n_resamples", "0")
     assert "0 of 2 clusters are stable (at least 0.75), 2 unknown\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("colour", ["class", "cluster", "volume", "age", "scanner"])
 def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
-    colour, root, tmp_path, monkeypatch, capsys
+    colour, root, tmp_path, capsys
 ):
-    igps(monkeypatch, root, "clusters", root, *OWN, "--colour", colour, "--out", tmp_path)
+    igps(root, "clusters", root, *OWN, "--colour", colour, "--out", tmp_path)
     rows = table(tmp_path / "clusters.csv")
     dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
     found = body_map(chi_square(*2 * [describe(dataset, small_interior())]).numpy())
@@ -487,12 +484,12 @@ def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
     assert (tmp_path / "map.svg").read_text().startswith("<?xml")
 
 
-def test_a_column_called_as_the_coordinates_leaves_them_alone(root, tmp_path, monkeypatch, capsys):
+def test_a_column_called_as_the_coordinates_leaves_them_alone(root, tmp_path, capsys):
     rows = table(root / "labels.csv")
     (tmp_path / "labels.csv").write_text(
         "file,x\n" + "".join(f"{root / row['file']},7\n" for row in rows)
     )
-    igps(monkeypatch, root, "map", tmp_path, *OWN, "--colour", "x", "--out", tmp_path)
+    igps(root, "map", tmp_path, *OWN, "--colour", "x", "--out", tmp_path)
     assert "igps: map is a part of igps clusters now." in capsys.readouterr().err
     found = table(tmp_path / "clusters.csv")
     assert {row["x of labels.csv"] for row in found} == {"7.0"}
@@ -552,22 +549,22 @@ def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path):
     ],
 )
 def test_what_labels_do_not_tell_is_refused_before_anything_is_computed(
-    command, message, root, tmp_path, monkeypatch, capsys
+    command, message, root, tmp_path, capsys
 ):
     cache = ["--cache_dir", tmp_path / "cache"]
     where = next(i for i, word in enumerate(command) if word.startswith("--"))
     words = [*command[:where], root, *command[where:], *OWN, *cache, *SMALL]
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, *words)
+        run(*words)
     assert message in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()
 
 
-def test_three_classes_are_refused_before_anything_is_computed(tmp_path, monkeypatch, capsys):
+def test_three_classes_are_refused_before_anything_is_computed(tmp_path, capsys):
     for label in "abc":
         write_egg(tmp_path / "eggs" / label / "0.off", 1.0, subdivisions=2)
     words = ["explain", tmp_path / "eggs", "--cache_dir", tmp_path / "cache"]
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, *words)
+        run(*words)
     assert "expected a folder of two groups, got 3" in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()

@@ -10,12 +10,9 @@ from own_descriptors import write_egg
 INTERIOR = "own_descriptors:small_interior"
 
 
-def test_what_joins_a_descriptor_joins_the_one_that_is_computed_for_where_none_is_named(
-    tmp_path, monkeypatch
-):
+def test_what_joins_a_descriptor_joins_the_one_that_is_computed_for_where_none_is_named(tmp_path):
     write_egg(tmp_path / "eggs" / "0.off", 2.0, subdivisions=2)
     run(
-        monkeypatch,
         "precompute",
         tmp_path / "eggs",
         "--with",
@@ -31,14 +28,14 @@ def test_what_joins_a_descriptor_joins_the_one_that_is_computed_for_where_none_i
     assert None not in dataset.cached_keys()
 
 
-def test_a_mesh_in_place_of_a_folder_is_told_as_such(tmp_path, monkeypatch, capsys):
+def test_a_mesh_in_place_of_a_folder_is_told_as_such(tmp_path, capsys):
     write_egg(tmp_path / "egg.off", 2.0, subdivisions=2)
     for command in (
         ["retrieve", tmp_path / "egg.off"],
         ["query", tmp_path / "egg.off", "--gallery", tmp_path / "egg.off"],
     ):
         with pytest.raises(SystemExit, match="1"):
-            run(monkeypatch, *command, "--cache_dir", tmp_path / "cache")
+            run(*command, "--cache_dir", tmp_path / "cache")
         assert (
             capsys.readouterr().err
             == f"igps: {tmp_path / 'egg.off'}: expected a folder, got a file.\n"

@@ -44,10 +44,9 @@ def root(tmp_path):
     return tmp_path / "meshes"
 
 
-def test_retrieve_prints_and_writes_what_python_computes(root, tmp_path, monkeypatch, capsys):
+def test_retrieve_prints_and_writes_what_python_computes(root, tmp_path, capsys):
     out = tmp_path / "out"
     run(
-        monkeypatch,
         "retrieve",
         root,
         "--descriptor",
@@ -114,11 +113,11 @@ def test_retrieve_prints_and_writes_what_python_computes(root, tmp_path, monkeyp
     assert not (out / "failures.csv").exists()
 
 
-def test_some_bodies_ask_the_others(root, tmp_path, monkeypatch, capsys):
+def test_some_bodies_ask_the_others(root, tmp_path, capsys):
     """The second egg and ball ask the first and the third."""
     words = ["--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL]
     out = tmp_path / "out"
-    run(monkeypatch, "retrieve", root, "--queries", "*/1.off", "--out", out, *words)
+    run("retrieve", root, "--queries", "*/1.off", "--out", out, *words)
     assert "2 queries, each against all that are no queries" in capsys.readouterr().out
     rows = list(csv.DictReader((out / "ranking.csv").open(newline="")))
     assert {row["query"] for row in rows} == {"ball/1.off", "egg/1.off"}
@@ -130,16 +129,14 @@ def test_some_bodies_ask_the_others(root, tmp_path, monkeypatch, capsys):
     expected = retrieval_scores(distances, ["ball", "egg"], ["ball", "ball", "egg", "egg"]).mean()
     scores = json.loads((out / "scores.json").read_text())
     assert {name: scores[name] for name in expected} == pytest.approx(expected)
-    wrong = error_of(monkeypatch, capsys, "retrieve", root, "--queries", "left/*", *words)
+    wrong = error_of(capsys, "retrieve", root, "--queries", "left/*", *words)
     assert "queries: expected a pattern that some bodies match, 0 of 6 match" in wrong
 
 
-def test_bodies_of_which_no_two_share_a_class_are_ranked_without_scores(
-    root, tmp_path, monkeypatch, capsys
-):
+def test_bodies_of_which_no_two_share_a_class_are_ranked_without_scores(root, tmp_path, capsys):
     words = ["--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL]
     out = tmp_path / "out"
-    run(monkeypatch, "retrieve", root, "--classes", "file", "--out", out, *words)
+    run("retrieve", root, "--classes", "file", "--out", out, *words)
     assert "no class has two bodies: rankings without scores" in capsys.readouterr().out
     rows = list(csv.DictReader((out / "ranking.csv").open(newline="")))
     assert [row["relevant"] for row in rows] == ["0"] * 6 * 5
@@ -157,14 +154,14 @@ def test_results_are_written_though_nobody_reads_what_is_printed(root, tmp_path,
 
     monkeypatch.setattr("igps.cli.retrieval_commands.print", gone, raising=False)
     with pytest.raises(SystemExit):
-        run(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", tmp_path / "out", *SMALL)
+        run("retrieve", root, "--descriptor", "d2", "--out", tmp_path / "out", *SMALL)
     assert (tmp_path / "out" / "scores.json").exists()
 
 
-def test_retrieve_reranks_in_a_table_of_its_own(root, tmp_path, monkeypatch, capsys):
+def test_retrieve_reranks_in_a_table_of_its_own(root, tmp_path, capsys):
     options = ("--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL)
     for name, further in (("plain", ()), ("both", ("--rerank",))):
-        run(monkeypatch, "retrieve", root, "--out", tmp_path / name, *options, *further)
+        run("retrieve", root, "--out", tmp_path / name, *options, *further)
     printed = capsys.readouterr().out
     assert printed.count("re-ranked by the whole collection") == 1
     plain, both = (
@@ -179,7 +176,7 @@ def test_retrieve_reranks_in_a_table_of_its_own(root, tmp_path, monkeypatch, cap
     assert "reranked" not in plain
 
 
-def test_gps_is_another_descriptor_on_the_same_cache(root, tmp_path, monkeypatch):
+def test_gps_is_another_descriptor_on_the_same_cache(root, tmp_path):
     for name in ("interior", "gps"):
         arguments = [
             "--descriptor",
@@ -190,7 +187,7 @@ def test_gps_is_another_descriptor_on_the_same_cache(root, tmp_path, monkeypatch
             tmp_path / "cache",
             *SMALL,
         ]
-        run(monkeypatch, "retrieve", root, *arguments)
+        run("retrieve", root, *arguments)
     interior, gps = (
         json.loads((tmp_path / name / "scores.json").read_text()) for name in ("interior", "gps")
     )
@@ -218,7 +215,7 @@ def test_a_second_run_describes_nothing_and_leaves_the_same_table(root, tmp_path
             tmp_path / "cache",
             *SMALL,
         ]
-        run(monkeypatch, "retrieve", root, *arguments)
+        run("retrieve", root, *arguments)
         return {path.name: path.read_bytes() for path in (tmp_path / name).glob("*.[cj]s*")}
 
     first = retrieved("first")
@@ -231,7 +228,7 @@ def test_a_second_run_describes_nothing_and_leaves_the_same_table(root, tmp_path
     assert retrieved("second") == first
 
 
-def test_only_the_eigenpairs_that_are_needed_are_computed(root, tmp_path, monkeypatch):
+def test_only_the_eigenpairs_that_are_needed_are_computed(root, tmp_path):
     """Unless a number is given, and unless a cache has more."""
     for path in (
         *root.glob("egg/*"),
@@ -243,7 +240,6 @@ def test_only_the_eigenpairs_that_are_needed_are_computed(root, tmp_path, monkey
     def retrieved(cache, *more):
         out = tmp_path / "out"
         run(
-            monkeypatch,
             "retrieve",
             root,
             "--out",
@@ -280,7 +276,7 @@ def test_only_the_eigenpairs_that_are_needed_are_computed(root, tmp_path, monkey
     assert computed("explicit") == {70}
 
 
-def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(root, tmp_path, monkeypatch, capsys):
+def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(root, tmp_path, capsys):
     (root / "egg" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     arguments = [
         "retrieve",
@@ -293,7 +289,7 @@ def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(root, tmp_path, monkeyp
         tmp_path / "out",
         *SMALL,
     ]
-    run(monkeypatch, *arguments)
+    run(*arguments)
     assert "1 of 7 bodies could not be used" in capsys.readouterr().out
     (row,) = csv.DictReader((tmp_path / "out" / "failures.csv").open(newline=""))
     assert row["name"] == "egg/bad.off"
@@ -307,21 +303,21 @@ def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(root, tmp_path, monkeyp
     ]
 
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, *arguments, "--strict")
+        run(*arguments, "--strict")
     error = capsys.readouterr().err
     assert "bad.off" in error
     assert "Traceback" not in error
 
     (root / "egg" / "bad.off").unlink()
-    run(monkeypatch, *arguments)
+    run(*arguments)
     assert not (tmp_path / "out" / "failures.csv").exists()
 
 
-def test_extract_files_and_folder(root, tmp_path, monkeypatch):
+def test_extract_files_and_folder(root, tmp_path):
     files = [root / "egg" / "1.off", root / "ball" / "0.off"]
     common = ["--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL]
-    run(monkeypatch, "extract", *files, "--out", tmp_path / "two.npz", *common)
-    run(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *common)
+    run("extract", *files, "--out", tmp_path / "two.npz", *common)
+    run("extract", root, "--out", tmp_path / "deep" / "all.npz", *common)
     with np.load(tmp_path / "two.npz") as two, np.load(tmp_path / "deep" / "all.npz") as everything:
         assert two["names"].tolist() == [str(f) for f in files]
         assert two["features"].shape == (2, 10, 64)
@@ -332,11 +328,11 @@ def test_extract_files_and_folder(root, tmp_path, monkeypatch):
         assert_allclose(two["features"], expected, atol=1e-7)
 
 
-def test_extract_short_vectors(root, tmp_path, monkeypatch, capsys):
+def test_extract_short_vectors(root, tmp_path, capsys):
     """Of `pretrained`, of which a database takes no more than 256 numbers; a histogram has none."""
     common = ["extract", root / "egg", "--cache_dir", tmp_path / "cache", "--n_workers", "1"]
-    run(monkeypatch, *common, "--out", tmp_path / "long.npz")
-    run(monkeypatch, *common, "--short", "--out", tmp_path / "short.npz")
+    run(*common, "--out", tmp_path / "long.npz")
+    run(*common, "--short", "--out", tmp_path / "short.npz")
     with np.load(tmp_path / "long.npz") as long, np.load(tmp_path / "short.npz") as short:
         assert long["features"].shape[1] > 256 >= short["features"].shape[1]
         found = np.linalg.norm(short["features"], axis=1)
@@ -347,7 +343,6 @@ def test_extract_short_vectors(root, tmp_path, monkeypatch, capsys):
         assert_allclose(short["features"], expected, atol=1e-6)
     with pytest.raises(SystemExit, match="1"):
         run(
-            monkeypatch,
             *common,
             "--short",
             "--descriptor",
@@ -359,11 +354,10 @@ def test_extract_short_vectors(root, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "none.npz").exists()
 
 
-def test_query_lists_the_nearest(root, tmp_path, monkeypatch, capsys):
+def test_query_lists_the_nearest(root, tmp_path, capsys):
     wanted = tmp_path / "wanted.off"
     wanted.write_bytes((root / "egg" / "1.off").read_bytes())
     run(
-        monkeypatch,
         "query",
         wanted,
         "--gallery",
@@ -421,13 +415,12 @@ def test_query_lists_the_nearest(root, tmp_path, monkeypatch, capsys):
         ),
     ],
 )
-def test_errors_are_one_line(root, tmp_path, monkeypatch, capsys, arguments, message):
+def test_errors_are_one_line(root, tmp_path, capsys, arguments, message):
     logging.disable(logging.WARNING)
     options = [] if "--paper" in arguments else SMALL
     try:
         with pytest.raises(SystemExit, match="1"):
             run(
-                monkeypatch,
                 *[a.replace("ROOT", str(root)) for a in arguments],
                 "--cache_dir",
                 tmp_path,
@@ -440,9 +433,7 @@ def test_errors_are_one_line(root, tmp_path, monkeypatch, capsys, arguments, mes
     assert re.search(message, error[0])
 
 
-def test_too_few_eigenpairs_are_refused_in_the_same_words_as_in_python(
-    root, tmp_path, monkeypatch, capsys
-):
+def test_too_few_eigenpairs_are_refused_in_the_same_words_as_in_python(root, tmp_path, capsys):
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     with pytest.raises(ValueError, match="needs signatures of at least 250, got 20") as raised:
         describe(dataset, descriptor("interior"))
@@ -456,14 +447,14 @@ def test_too_few_eigenpairs_are_refused_in_the_same_words_as_in_python(
     ):
         chosen = ["--descriptors" if command[0] == "compare" else "--descriptor", "interior"]
         with pytest.raises(SystemExit, match="1"):
-            run(monkeypatch, *command, *chosen, "--cache_dir", tmp_path / "cache", *SMALL)
+            run(*command, *chosen, "--cache_dir", tmp_path / "cache", *SMALL)
         assert f"igps: {raised.value}" in capsys.readouterr().err.splitlines()
 
 
-def test_a_compared_descriptor_retrieves(root, tmp_path, monkeypatch):
+def test_a_compared_descriptor_retrieves(root, tmp_path):
     out = tmp_path / "out"
     options = ["--cache_dir", tmp_path / "cache", *SMALL]
-    run(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", out, *options)
+    run("retrieve", root, "--descriptor", "d2", "--out", out, *options)
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     described = describe(dataset, D2(), n_workers=1)
     expected = torch.cdist(described, described, p=1) / 2
@@ -474,7 +465,7 @@ def test_a_compared_descriptor_retrieves(root, tmp_path, monkeypatch):
     assert scores["config"]["descriptor"] == "d2"
 
 
-def test_a_mesh_that_cannot_be_described_is_a_failure(root, tmp_path, monkeypatch, capsys):
+def test_a_mesh_that_cannot_be_described_is_a_failure(root, tmp_path, capsys):
     logging.disable(logging.WARNING)
     (root / "egg" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     arguments = [
@@ -487,7 +478,7 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(root, tmp_path, monkeypatc
     ]
     arguments += ["--cache_dir", tmp_path / "cache", *SMALL]
     try:
-        run(monkeypatch, *arguments)
+        run(*arguments)
         assert "2 of 7 bodies could not be used" in capsys.readouterr().out
         rows = list(csv.DictReader((tmp_path / "out" / "failures.csv").open(newline="")))
         assert [row["name"] for row in rows] == ["egg/bad.off", "egg/1.off"]
@@ -501,7 +492,7 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(root, tmp_path, monkeypatc
         ]
         (root / "egg" / "bad.off").unlink()
         with pytest.raises(SystemExit, match="1"):
-            run(monkeypatch, *arguments, "--strict")
+            run(*arguments, "--strict")
         assert "too much" in capsys.readouterr().err
     finally:
         logging.disable(logging.NOTSET)
@@ -510,7 +501,7 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(root, tmp_path, monkeypatc
 def test_an_interruption_is_told_in_a_line(monkeypatch, capsys):
     monkeypatch.setitem(COMMANDS, "wait", "own_commands:wait")
     with pytest.raises(SystemExit, match="130"):
-        run(monkeypatch, "wait")
+        run("wait")
     assert (
         capsys.readouterr().err
         == "igps: interrupted. Run again to continue: finished results are kept.\n"
@@ -520,31 +511,30 @@ def test_an_interruption_is_told_in_a_line(monkeypatch, capsys):
 def test_what_takes_more_memory_than_there_is_is_told_in_a_line(monkeypatch, capsys):
     monkeypatch.setitem(COMMANDS, "ask", "own_commands:ask")
     with pytest.raises(SystemExit, match="2"):
-        run(monkeypatch, "ask")
+        run("ask")
     assert re.fullmatch(
         r"igps: out of memory \(.*1.00 PiB.*\). Reduce the input, .*\n", capsys.readouterr().err
     )
 
 
-def test_the_version_is_that_of_the_distribution(monkeypatch, capsys):
+def test_the_version_is_that_of_the_distribution(capsys):
     with pytest.raises(SystemExit, match="0"):
-        run(monkeypatch, "--version")
+        run("--version")
     assert capsys.readouterr().out.startswith(
         f"igps {importlib.metadata.version('interior-gps')}, signatures "
     )
 
 
-def test_json_is_what_the_table_tells(root, tmp_path, monkeypatch, capsys):
+def test_json_is_what_the_table_tells(root, tmp_path, capsys):
     options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", *SMALL]
     out = tmp_path / "out"
-    run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--out", out, "--json", *options)
+    run("retrieve", root, "--descriptor", INTERIOR, "--out", out, "--json", *options)
     printed = capsys.readouterr()
     assert json.loads(printed.out) == json.loads((out / "scores.json").read_text())
     assert "ADR self" in printed.err  # the table, where progress goes
 
     wanted = root / "ball" / "1.off"
     run(
-        monkeypatch,
         "query",
         wanted,
         "--gallery",
@@ -579,10 +569,10 @@ def test_json_is_what_the_table_tells(root, tmp_path, monkeypatch, capsys):
         "--json",
         *options,
     ]
-    run(monkeypatch, *words)
+    run(*words)
     assert json.loads(capsys.readouterr().out)[0]["class"] is None  # the folder tells none
 
-    run(monkeypatch, "compare", root, "--descriptors", INTERIOR, "--json", *options)
+    run("compare", root, "--descriptors", INTERIOR, "--json", *options)
     (row,) = json.loads(capsys.readouterr().out)
     expected = retrieval_scores(
         chi_square(histograms, histograms), dataset.bodies.labels or ()
@@ -590,12 +580,12 @@ def test_json_is_what_the_table_tells(root, tmp_path, monkeypatch, capsys):
     assert {name: row[name] for name in expected} == pytest.approx(expected)
 
 
-def test_json_has_no_numbers_that_json_does_not_know(root, tmp_path, monkeypatch, capsys):
+def test_json_has_no_numbers_that_json_does_not_know(root, tmp_path, capsys):
     """The scores of a class of one mesh are not defined."""
     for path in sorted((root / "egg").iterdir())[1:]:
         path.unlink()
     options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", *SMALL]
-    run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--json", *options)
+    run("retrieve", root, "--descriptor", INTERIOR, "--json", *options)
 
     def refuse(name):
         raise AssertionError(name)
@@ -605,7 +595,7 @@ def test_json_has_no_numbers_that_json_does_not_know(root, tmp_path, monkeypatch
     assert found["n_queries"] == 3
 
 
-def test_json_of_two_bodies_and_of_copies(root, tmp_path, monkeypatch, capsys):
+def test_json_of_two_bodies_and_of_copies(root, tmp_path, capsys):
     """A body, its copy at twice the size, and another."""
     ball = root / "ball" / "0.off"
     egg = root / "egg" / "0.off"
@@ -615,7 +605,7 @@ def test_json_of_two_bodies_and_of_copies(root, tmp_path, monkeypatch, capsys):
             path.unlink()
     trimesh.load(egg, process=False).apply_scale(2).export(larger)
     options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", "--json"]
-    run(monkeypatch, "duplicates", root, *options)
+    run("duplicates", root, *options)
     found = json.loads(capsys.readouterr().out)
     assert found["groups"] == [["egg/0.off", "egg/1.off"]]
     assert found["n_files"] == 3
@@ -623,7 +613,7 @@ def test_json_of_two_bodies_and_of_copies(root, tmp_path, monkeypatch, capsys):
     (pair,) = found["pairs"]
     assert pair["files"] == ["egg/0.off", "egg/1.off"]
     for other in (larger, ball):
-        run(monkeypatch, "explain", egg, other, *options)
+        run("explain", egg, other, *options)
         printed = capsys.readouterr()
         told = json.loads(printed.out)
         assert told["meaning"] in printed.err  # the sentence, where progress goes
@@ -646,7 +636,7 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
 
     def told(place):
         with pytest.raises(SystemExit, match="1"):
-            run(monkeypatch, *given, "--out", place)
+            run(*given, "--out", place)
         return capsys.readouterr().err.splitlines()[-1]
 
     monkeypatch.setattr(
@@ -742,9 +732,8 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
     ],
 )
 def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
-    words, told, root, tmp_path, monkeypatch, capsys
+    words, told, root, tmp_path, here, monkeypatch, capsys
 ):
-    monkeypatch.chdir(tmp_path)
     descriptor("d2").save("plain.safetensors", {})
     shutil.copytree(root / "egg", tmp_path / "TWO")
     (tmp_path / "TWO" / "2.off").unlink()
@@ -754,7 +743,7 @@ def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
         SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
     )
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, *(places.get(word, word) for word in words))
+        run(*(places.get(word, word) for word in words))
     assert capsys.readouterr().err.startswith(f"igps: {told.replace('ROOT', str(root))}")
 
 
@@ -763,7 +752,7 @@ def test_a_list_of_failures_is_no_folder(root, tmp_path, monkeypatch, capsys):
         SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
     )
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, "precompute", root, "--failures", tmp_path)
+        run("precompute", root, "--failures", tmp_path)
     assert (
         capsys.readouterr().err
         == f"igps: failures: expected a file, {tmp_path} is a folder. Choose another path.\n"
@@ -771,9 +760,9 @@ def test_a_list_of_failures_is_no_folder(root, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_completion_knows_commands_and_options(shell, tmp_path, monkeypatch, capsys):
+def test_completion_knows_commands_and_options(shell, tmp_path, capsys):
     """The shell itself reads the script, and completes by it."""
-    run(monkeypatch, "help", shell)
+    run("help", shell)
     script = capsys.readouterr().out
     for word in ("retrieve", "doctor", "--mend", "--cache_dir"):
         assert word in script

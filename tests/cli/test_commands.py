@@ -51,13 +51,13 @@ def igps_with(*words: str, code: str = "") -> subprocess.CompletedProcess[str]:
 
 
 def test_a_cached_folder_is_queried_without_compiled_loops_and_without_workers(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     shapes = tmp_path / "shapes"
     igps.ArticulatedShapes(n_classes=2, n_per_class=2, n_vertices=500).write(shapes)
     first = next(shapes.rglob("*.off"))
     words = ("query", str(first), "--gallery", str(shapes), "--cache_dir", str(tmp_path / "cache"))
-    run(monkeypatch, *words)
+    run(*words)
     done = igps_with(*words, code=NO_WORKERS)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "HEAVY ['torch', 'numpy', 'scipy']"
@@ -126,16 +126,16 @@ def test_the_help_of_a_command_has_its_options_and_those_that_people_use(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit, match="0"):
-        run(monkeypatch, "gallery", "build", "--help")
+        run("gallery", "build", "--help")
     text = " ".join(capsys.readouterr().out.split())
     assert text.startswith("usage: igps gallery build root --out OUT [options] ")
     for words in ("--descriptor", "--bodies {whole,labels,objects", "--cache_dir", "--options"):
         assert words in text
     assert "--signature" not in text
     with pytest.raises(SystemExit, match="2"):
-        run(monkeypatch, "gallery", "build")
+        run("gallery", "build")
     assert "required: root, --out" in capsys.readouterr().err
-    run(monkeypatch, "help", "options")
+    run("help", "options")
     text = " ".join(capsys.readouterr().out.split())
     for words in (
         "--signature.seed SEED",
@@ -143,7 +143,7 @@ def test_the_help_of_a_command_has_its_options_and_those_that_people_use(
         "never refines it (default: 1000)",
     ):
         assert words in text
-    run(monkeypatch, "help", "descriptors")
+    run("help", "descriptors")
     assert "pretrained" in capsys.readouterr().out.split()
 
 
@@ -188,20 +188,20 @@ def test_a_function_is_a_command(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(COMMANDS, "pose", "own_commands:pose")  # type: ignore[misc]
-    run(monkeypatch, "pose", "a.off", "--classes", "1", "2", "--exact")
-    run(monkeypatch, "pose", "a.off", "--length", "3")
+    run("pose", "a.off", "--classes", "1", "2", "--exact")
+    run("pose", "a.off", "--length", "3")
     assert capsys.readouterr().out.splitlines() == ["a.off [1, 2] True 2.0", "a.off None False 3.0"]
     with pytest.raises(SystemExit, match="0"):
-        run(monkeypatch, "pose", "--help")
+        run("pose", "--help")
     text = capsys.readouterr().out
     assert all(words in text for words in ("what to draw", "which to show", "(default: 2.0)"))
 
 
 def test_options_that_contradict_each_other_are_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     words = ["doctor", tmp_path, "--mend", "always", "--allow_open"]
-    assert "allow_open: expected" in error_of(monkeypatch, capsys, *words)
+    assert "allow_open: expected" in error_of(capsys, *words)
 
 
 def test_nobody_reading_the_output_is_no_error() -> None:

@@ -32,11 +32,11 @@ def root(tmp_path_factory):
     return folder / "meshes"
 
 
-def test_command_prints_and_writes_what_python_computes(root, tmp_path, monkeypatch, capsys):
+def test_command_prints_and_writes_what_python_computes(root, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["shape_dna", "d2", "own_descriptors:small_interior"]
     cache = ["--cache_dir", root.parent / "cache"]
-    run(monkeypatch, "compare", root, "--descriptors", *words, "--out", out, *cache, *SMALL)
+    run("compare", root, "--descriptors", *words, "--out", out, *cache, *SMALL)
     printed = capsys.readouterr().out.splitlines()
 
     chosen = [descriptor("shape_dna"), descriptor("d2"), small_interior()]
@@ -63,13 +63,13 @@ def test_command_prints_and_writes_what_python_computes(root, tmp_path, monkeypa
     assert imread(out / "precision_recall.png").std() > 0.05
 
 
-def test_the_papers_the_learned_and_the_compared_run_side_by_side(tmp_path, monkeypatch, capsys):
+def test_the_papers_the_learned_and_the_compared_run_side_by_side(tmp_path, capsys):
     ArticulatedShapes(n_classes=2, n_per_class=2, seed=5, n_vertices=500).write(tmp_path / "meshes")
     options = ["--signature.resolution", 12, "--signature.n_surface_samples", 100]
     options += ["--signature.min_samples", 100, "--n_workers", 1]
     options += ["--cache_dir", tmp_path / "cache", "--out", tmp_path / "out"]
     names = ["interior", "rich", "pretrained", "d2"]
-    run(monkeypatch, "compare", tmp_path / "meshes", "--descriptors", *names, *options)
+    run("compare", tmp_path / "meshes", "--descriptors", *names, *options)
     printed = capsys.readouterr().out
     rows = json.loads((tmp_path / "out" / "compare.json").read_text())
     assert [row["descriptor"] for row in rows] == names
@@ -87,9 +87,7 @@ def test_the_papers_the_learned_and_the_compared_run_side_by_side(tmp_path, monk
     assert rows[1]["nn"] == rows[2]["nn"] == 1
 
 
-def test_command_lists_failures_by_descriptor_and_of_signatures(
-    root, tmp_path, monkeypatch, capsys
-):
+def test_command_lists_failures_by_descriptor_and_of_signatures(root, tmp_path, capsys):
     logging.disable(logging.WARNING)
     bad = root / "egg" / "bad.off"
     bad.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
@@ -97,7 +95,7 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
     arguments += [*SMALL, "--descriptors"]
     chosen = ["own_descriptors:picky", "own_descriptors:broken"]
     try:
-        run(monkeypatch, *arguments, *chosen)
+        run(*arguments, *chosen)
         rows = list(csv.reader((tmp_path / "failures.csv").open(newline="")))
         assert rows[0] == ["descriptor", "name", "error"]
         found = [row[:2] for row in rows[1:]]
@@ -112,22 +110,20 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
 
         bad.unlink()
         with pytest.raises(SystemExit, match="1"):
-            run(monkeypatch, *arguments, *chosen, "--strict")
+            run(*arguments, *chosen, "--strict")
         assert "igps: picky: " in capsys.readouterr().err
 
-        run(monkeypatch, *arguments, "own_descriptors:Height")
+        run(*arguments, "own_descriptors:Height")
         assert not (tmp_path / "failures.csv").exists()
     finally:
         logging.disable(logging.NOTSET)
         bad.unlink(missing_ok=True)
 
 
-def test_unknown_descriptor_is_named_before_anything_is_computed(
-    root, tmp_path, monkeypatch, capsys
-):
+def test_unknown_descriptor_is_named_before_anything_is_computed(root, tmp_path, capsys):
     words = ["compare", root, "--descriptors", "d2", "d5", "--cache_dir", tmp_path / "cache"]
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, *words)
+        run(*words)
     error = capsys.readouterr().err
     known = ", ".join([*NAMES, *FIELD_NAMES])
     assert f"expected one of {known}, or package.module:NAME" in error

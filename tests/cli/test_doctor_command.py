@@ -19,13 +19,13 @@ from damaged_files import (
 FEW = ["--signature.n_eigenpairs", "20", "--n_workers", "1"]
 
 
-def test_table_and_file_of_a_folder_that_can_be_used(tmp_path, monkeypatch, capsys):
+def test_table_and_file_of_a_folder_that_can_be_used(tmp_path, capsys):
     root = tmp_path / "meshes"
     out = tmp_path / "deep" / "doctor.csv"
     write_clean(root / "a" / "clean.off")
     write_soup(root / "a" / "soup.off")
     write_box(root / "b" / "box.off")
-    run(monkeypatch, "doctor", root, "--out", out, *FEW)  # no status: nothing is raised
+    run("doctor", root, "--out", out, *FEW)  # no status: nothing is raised
     header, *lines, total, written = capsys.readouterr().out.splitlines()
     assert header.split() == ["vertices", "after", "seconds", "MB", "unit", "remarks"]
     cells = {line.split()[0]: line.split()[1:] for line in lines}
@@ -64,7 +64,7 @@ def test_status_is_1_if_a_file_cannot_be_used(tmp_path, monkeypatch, capsys):
     write_clean(root / "clean.off")
     sentences = write_unusable(root)
     with pytest.raises(SystemExit) as stopped:
-        run(monkeypatch, "doctor", root, "--out", out, *FEW)
+        run("doctor", root, "--out", out, *FEW)
     assert stopped.value.code == 1
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
@@ -82,24 +82,24 @@ def test_status_is_1_if_a_file_cannot_be_used(tmp_path, monkeypatch, capsys):
         assert rows[name]["error"] == f"{root / name}: {sentence}"
 
 
-def test_options_choose_the_mending(tmp_path, monkeypatch, capsys):
+def test_options_choose_the_mending(tmp_path, capsys):
     write_holed(tmp_path / "holed.off")
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, "doctor", tmp_path, "--mend", "never", *FEW)
+        run("doctor", tmp_path, "--mend", "never", *FEW)
     assert "cannot be used" in capsys.readouterr().out
-    run(monkeypatch, "doctor", tmp_path, "--mend", "always", *FEW)
+    run("doctor", tmp_path, "--mend", "always", *FEW)
     assert "; watertight; closed 1 opening" in capsys.readouterr().out.splitlines()[1]
 
 
-def test_a_folder_without_meshes_is_an_error(tmp_path, monkeypatch, capsys):
+def test_a_folder_without_meshes_is_an_error(tmp_path, capsys):
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, "doctor", tmp_path, *FEW)
+        run("doctor", tmp_path, *FEW)
     assert f"igps: {tmp_path}: no body found" in capsys.readouterr().err
 
 
-def test_files_that_bodies_bring_along_are_not_examined(tmp_path, monkeypatch, capsys):
+def test_files_that_bodies_bring_along_are_not_examined(tmp_path, capsys):
     write_clean(tmp_path / "a" / "clean.off")
     write_clean(tmp_path / "a" / "clean_fields.off")
-    run(monkeypatch, "doctor", tmp_path, "--attribute", "f=a/{stem}_fields.off", *FEW)
+    run("doctor", tmp_path, "--attribute", "f=a/{stem}_fields.off", *FEW)
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("1 body: 0 repaired, 0 cannot be used")

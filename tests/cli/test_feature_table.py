@@ -31,14 +31,14 @@ def root(tmp_path_factory):
     return folder
 
 
-def extract(monkeypatch, root, out, *options):
+def extract(root, out, *options):
     cache = ["--cache_dir", str(root.parent / "cache"), "--n_workers", "1"]
     words = ["extract", root, "--out", out, "--descriptor", INTERIOR]
-    run(monkeypatch, *words, *SMALL, *cache, *options)
+    run(*words, *SMALL, *cache, *options)
 
 
-def test_a_row_for_each_body_tells_what_is_known_of_it(root, tmp_path, monkeypatch, capsys):
-    extract(monkeypatch, root, tmp_path / "features.csv")
+def test_a_row_for_each_body_tells_what_is_known_of_it(root, tmp_path, capsys):
+    extract(root, tmp_path / "features.csv")
     printed = capsys.readouterr().out
     assert "4 bodies written to" in printed
     assert "compare it by igps.descriptor(" in printed
@@ -66,7 +66,7 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(root, tmp_path, monkeypat
     assert_allclose(places, centres, atol=0.1)
     ball = (36 * np.pi) ** (1 / 3) * table["volume_mm3"] ** (2 / 3)
     assert_allclose(table["area_mm2"] * table["sphericity"], ball)
-    extract(monkeypatch, root, tmp_path / "features.npz")
+    extract(root, tmp_path / "features.npz")
     with np.load(tmp_path / "features.npz") as archive:
         vectors = archive["features"].reshape(4, -1)
     size = ["size.log_area", "size.log_volume"]  # as there is a unit
@@ -76,12 +76,12 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(root, tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_a_wide_table_has_a_row_for_each_file(root, tmp_path, monkeypatch, suffix):
+def test_a_wide_table_has_a_row_for_each_file(root, tmp_path, suffix):
     if suffix == "parquet":
         pytest.importorskip("pyarrow", reason="the extra [table]")
     read = pd.read_csv if suffix == "csv" else pd.read_parquet
-    extract(monkeypatch, root, tmp_path / f"long.{suffix}")
-    extract(monkeypatch, root, tmp_path / f"wide.{suffix}", "--wide")
+    extract(root, tmp_path / f"long.{suffix}")
+    extract(root, tmp_path / f"wide.{suffix}", "--wide")
     long = read(tmp_path / f"long.{suffix}")
     wide = read(tmp_path / f"wide.{suffix}")
     first = ["file", "class", "age", "unit", "liver.at_border", "liver.border_sides", "liver.notes"]
@@ -96,7 +96,7 @@ def test_a_wide_table_has_a_row_for_each_file(root, tmp_path, monkeypatch, suffi
             assert wide[f"{part}.{column}"].tolist() == rows[column].tolist()
 
 
-def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path, monkeypatch, capsys):
+def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path, capsys):
     """As TotalSegmentator writes them: two subjects with a cube and a bar, the third without the bar."""
     for i, sides in enumerate(
         [
@@ -116,7 +116,7 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path, monkeypatch
     ]
     lines = [f"{row},{row[:2]},{'b' if row.startswith('s2') else 'a'}" for row in rows]
     (tmp_path / "masks" / "labels.csv").write_text("\n".join(["file,label,folder", *lines]))
-    extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
+    extract(tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     assert wide["folder"].tolist() == [f"s{i}/segmentations" for i in range(3)]
     expected = [512, 729, 1000]
@@ -132,14 +132,14 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path, monkeypatch
     assert wide["class"].tolist() == ["s0", "s1", "s2"]
     assert "wide.csv, rows: 3" in capsys.readouterr().out
     # Of a single subject
-    extract(monkeypatch, tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide")
+    extract(tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide")
     one = pd.read_csv(tmp_path / "one.csv")
     found = one[["bar.volume_mm3", "cube.volume_mm3"]]
     expected = [[375, 512]]
     assert_allclose(found, expected, rtol=1e-3)
 
 
-def test_masks_that_are_numbered_have_a_row_each(tmp_path, monkeypatch):
+def test_masks_that_are_numbered_have_a_row_each(tmp_path):
     """Two subjects of each class: a number is no organ's name."""
     sides = {("ill", 0): 5, ("ill", 1): 6, ("well", 0): 7, ("well", 1): 8}
     for (label, number), side in sides.items():
@@ -147,7 +147,7 @@ def test_masks_that_are_numbered_have_a_row_each(tmp_path, monkeypatch):
         mask = np.zeros((12, 12, 12), dtype=np.uint8)
         mask[2 : 2 + side, 2:9, 2:9] = 1
         nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), folder / f"{number}.nii.gz")
-    extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
+    extract(tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     border = ["at_border", "border_sides"]
     found = wide.columns.tolist()[:6]
@@ -157,11 +157,11 @@ def test_masks_that_are_numbered_have_a_row_each(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("options", [[], ["--wide"]])
-def test_columns_that_are_called_as_ours_are_kept_beside_them(options, root, tmp_path, monkeypatch):
+def test_columns_that_are_called_as_ours_are_kept_beside_them(options, root, tmp_path):
     (tmp_path / "labels.csv").write_text(
         f"file,volume_mm3,unit,v0,age\n{root / '1.nii.gz'},7,left,x,40\n{root / '2.nii.gz'},8,right,y,50\n"
     )
-    extract(monkeypatch, tmp_path, tmp_path / "features.csv", *options)
+    extract(tmp_path, tmp_path / "features.csv", *options)
     table = pd.read_csv(tmp_path / "features.csv")
     n_rows, ours = (1, "liver.volume_mm3") if options else (2, "volume_mm3")
     assert table["volume_mm3 of labels.csv"].tolist() == [7] * n_rows + [8] * n_rows
@@ -172,13 +172,13 @@ def test_columns_that_are_called_as_ours_are_kept_beside_them(options, root, tmp
     assert table["unit"].tolist() == ["mm"] * len(table)
 
 
-def test_a_body_that_a_file_lacks_has_no_values(root, tmp_path, monkeypatch):
+def test_a_body_that_a_file_lacks_has_no_values(root, tmp_path):
     for name in ("1.nii.gz", "2.nii.gz", "1.csv", "2.csv"):
         (tmp_path / name).write_bytes((root / name).read_bytes())
     (tmp_path / "labels.csv").write_text(
         "file,body,label\n1.nii.gz,liver,a\n2.nii.gz,liver,b\n2.nii.gz,spleen,c\n"
     )
-    extract(monkeypatch, tmp_path, tmp_path / "wide.csv", "--wide")
+    extract(tmp_path, tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     assert wide["liver.class"].tolist() == ["a", "b"]
     found = wide.loc[:, "spleen.class":].isna().all(axis=1).tolist()
@@ -193,10 +193,10 @@ def test_a_body_that_a_file_lacks_has_no_values(root, tmp_path, monkeypatch):
     ],
 )
 def test_a_file_of_another_kind_is_refused_before_anything_is_computed(
-    root, tmp_path, monkeypatch, capsys, options, words
+    root, tmp_path, capsys, options, words
 ):
     with pytest.raises(SystemExit, match="1"):
-        extract(monkeypatch, root, tmp_path / options[0], *options[1:])
+        extract(root, tmp_path / options[0], *options[1:])
     assert words in capsys.readouterr().err.replace("one of ", "")
 
 
@@ -208,7 +208,7 @@ def test_plain_numbers_alone_need_no_eigenpairs_and_notes_stand_in_the_row(tmp_p
     words = ["extract", tmp_path, "--out", tmp_path / "plain.csv", "--descriptor", "measures"]
     cache = ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
     monkeypatch.setattr("igps.spectra.eigenpairs", None)  # plain numbers need none
-    run(monkeypatch, *words, *cache)
+    run(*words, *cache)
     table = pd.read_csv(tmp_path / "plain.csv", keep_default_na=False)
     own = ["file", "part", "name", "class", "unit", "at_border", "border_sides", "notes"]
     assert table.columns.tolist()[:8] == own

@@ -30,16 +30,16 @@ def root(tmp_path_factory):
     return folder
 
 
-def call(monkeypatch, root, *words):
-    run(monkeypatch, *words, "--cache_dir", root / "cache", "--n_workers", 1, *SMALL)
+def call(root, *words):
+    run(*words, "--cache_dir", root / "cache", "--n_workers", 1, *SMALL)
 
 
 @pytest.fixture
-def model(root, monkeypatch):
+def model(root):
     path = root / "out" / "mine.safetensors"
     if not path.exists():
         options = ["--descriptor", "rich", "--head", "classifier", "--out", path]
-        call(monkeypatch, root, "fit", root / "eggs", *options)
+        call(root, "fit", root / "eggs", *options)
     return path
 
 
@@ -49,9 +49,9 @@ def dataset(root, model):
     return library.SignatureDataset(root / "eggs", config, root / "cache", descriptor=chosen)
 
 
-def test_fit_writes_model_and_card(root, tmp_path, monkeypatch, capsys):
+def test_fit_writes_model_and_card(root, tmp_path, capsys):
     out = tmp_path / "mine.safetensors"
-    call(monkeypatch, root, "fit", root / "eggs", "--descriptor", "rich", "--out", out, "--json")
+    call(root, "fit", root / "eggs", "--descriptor", "rich", "--out", out, "--json")
     told = json.loads(capsys.readouterr().out)
     card = library.load(out).card
     assert {**card, "n_refused": 0} == told
@@ -67,65 +67,64 @@ def test_fit_writes_model_and_card(root, tmp_path, monkeypatch, capsys):
     assert "the result says little about\nform" in page
 
 
-def test_fit_writes_a_folder_to_share(root, tmp_path, monkeypatch, capsys):
+def test_fit_writes_a_folder_to_share(root, tmp_path, capsys):
     words = ["fit", root / "eggs", "--descriptor", "rich", "--head", "classifier"]
-    call(monkeypatch, root, *words, "--out", tmp_path / "mine", "--json")
+    call(root, *words, "--out", tmp_path / "mine", "--json")
     told = json.loads(capsys.readouterr().out)
     files = {path.name for path in (tmp_path / "mine").iterdir()}
     assert files == {"model.safetensors", "README.md"}
     assert json.dumps(told["held_out_scores"]) in (tmp_path / "mine" / "README.md").read_text()
-    call(monkeypatch, root, "classify", root / "eggs", "--model", tmp_path / "mine", "--json")
+    call(root, "classify", root / "eggs", "--model", tmp_path / "mine", "--json")
     classes = [row["class"] for row in json.loads(capsys.readouterr().out)]
     assert classes == ["flat"] * 3 + ["long"] * 3
 
 
 @pytest.mark.parametrize("cavities", ["fill", "keep"])
 def test_bodies_that_are_read_otherwise_than_those_of_the_fit_are_told(
-    root, model, monkeypatch, capsys, cavities
+    root, model, capsys, cavities
 ):
-    call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--cavities", cavities)
+    call(root, "classify", root / "eggs", "--model", model, "--cavities", cavities)
     is_told = "read with --cavities fill, not keep" in capsys.readouterr().out
     assert is_told == (cavities == "keep")
 
 
-def test_every_command_takes_the_file(root, model, tmp_path, monkeypatch, capsys):
+def test_every_command_takes_the_file(root, model, tmp_path, here, capsys):
     found = library.load(model)
     expected = describe(dataset(root, model), found)
     eggs = root / "eggs"
     by_model = ["--descriptor", model]
-    call(monkeypatch, root, "extract", eggs, *by_model, "--out", tmp_path / "features.npz")
+    call(root, "extract", eggs, *by_model, "--out", tmp_path / "features.npz")
     with np.load(tmp_path / "features.npz") as archive:
         assert_allclose(archive["features"], expected, atol=1e-6)
-    call(monkeypatch, root, "retrieve", eggs, *by_model, "--out", tmp_path / "retrieved")
+    call(root, "retrieve", eggs, *by_model, "--out", tmp_path / "retrieved")
     with np.load(tmp_path / "retrieved" / "distances.npz") as archive:
         distances = found.distances(expected, expected)
         assert_allclose(archive["distances"], distances, atol=1e-6)
     compared = ["compare", eggs, "--descriptors", model, "interior"]
-    call(monkeypatch, root, *compared, "--out", tmp_path / "compared")
+    call(root, *compared, "--out", tmp_path / "compared")
     rows = json.loads((tmp_path / "compared" / "compare.json").read_text())
     assert [row["descriptor"] for row in rows] == ["rich_classifier", "interior"]
-    call(monkeypatch, root, "precompute", root / "eggs", "--descriptors", model)
+    call(root, "precompute", root / "eggs", "--descriptors", model)
 
     capsys.readouterr()
     query = ["query", root / "eggs" / "long" / "0.off", "--top", "3", "--json"]
-    call(monkeypatch, root, *query, "--gallery", root / "eggs", "--descriptor", model)
+    call(root, *query, "--gallery", root / "eggs", "--descriptor", model)
     nearest = json.loads(capsys.readouterr().out)
     assert [row["class"] for row in nearest] == ["long"] * 3
-    call(monkeypatch, root, "gallery", "build", eggs, *by_model, "--out", tmp_path / "eggs.igps")
-    monkeypatch.chdir(tmp_path)
+    call(root, "gallery", "build", eggs, *by_model, "--out", tmp_path / "eggs.igps")
     moved = tmp_path / "moved.safetensors"
     moved.write_bytes(model.read_bytes())
     for options in ([], ["--descriptor", "moved.safetensors"]):
         capsys.readouterr()
         words = [*query, "--gallery", "eggs.igps", *options, "--cache_dir", root / "cache"]
-        run(monkeypatch, *words)
+        run(*words)
         found = json.loads(capsys.readouterr().out)
         assert [row["name"] for row in found] == [row["name"] for row in nearest]
 
 
-def test_classify_tells_what_python_computes(root, model, tmp_path, monkeypatch, capsys):
+def test_classify_tells_what_python_computes(root, model, tmp_path, capsys):
     out = tmp_path / "classes.csv"
-    call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--out", out, "--json")
+    call(root, "classify", root / "eggs", "--model", model, "--out", out, "--json")
     told = json.loads(capsys.readouterr().out)
     expected = classify(dataset(root, model), str(model))
     assert [one["name"] for one in told] == list(expected.names)
@@ -141,13 +140,13 @@ def test_classify_tells_what_python_computes(root, model, tmp_path, monkeypatch,
     assert_allclose(written, expected.probabilities, atol=1e-6)
 
 
-def test_what_is_unlike_everything_is_said(root, model, tmp_path, monkeypatch, capsys):
+def test_what_is_unlike_everything_is_said(root, model, tmp_path, capsys):
     import trimesh
 
     box = trimesh.creation.box((1, 1, 12)).subdivide().subdivide().subdivide().subdivide()
     box.export(tmp_path / "rod.off")
     files = [tmp_path / "rod.off", root / "eggs" / "flat" / "1.off"]
-    call(monkeypatch, root, "classify", *files, "--model", model)
+    call(root, "classify", *files, "--model", model)
     lines = capsys.readouterr().out.splitlines()
     rod = next(line for line in lines if "rod.off" in line)
     assert "unlike every known class" in rod
@@ -155,7 +154,7 @@ def test_what_is_unlike_everything_is_said(root, model, tmp_path, monkeypatch, c
     assert next(line for line in lines if "1.off" in line).endswith("flat")
 
 
-def test_wrong_files_cost_one_sentence(root, model, tmp_path, monkeypatch, capsys):
+def test_wrong_files_cost_one_sentence(root, model, tmp_path, capsys):
     (tmp_path / "bad.safetensors").write_bytes(model.read_bytes()[:-10])
     eggs = root / "eggs"
     damaged = tmp_path / "bad.safetensors"
@@ -171,20 +170,18 @@ def test_wrong_files_cost_one_sentence(root, model, tmp_path, monkeypatch, capsy
         (absent, "no such file. Check the path."),
     ):
         with pytest.raises(SystemExit, match="1"):
-            call(monkeypatch, root, *words)
+            call(root, *words)
         told = capsys.readouterr().err.strip().splitlines()[-1]
         assert told.startswith("igps: ")
         assert message in told
 
 
-def test_what_no_file_can_hold_is_refused_before_anything_is_computed(
-    tmp_path, monkeypatch, capsys
-):
+def test_what_no_file_can_hold_is_refused_before_anything_is_computed(tmp_path, capsys):
     for label in "ab":
         write_egg(tmp_path / "eggs" / label / "0.off", 1.0)
     options = ["--descriptor", "own_descriptors:Height", "--out", tmp_path / "mine.safetensors"]
     with pytest.raises(SystemExit):
-        call(monkeypatch, tmp_path, "fit", tmp_path / "eggs", *options)
+        call(tmp_path, "fit", tmp_path / "eggs", *options)
     assert "expected to be made of modules of igps" in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()
 
@@ -200,6 +197,6 @@ def test_too_few_classes_are_told_before_anything_is_computed(
     for body_class in classes[:n_classes]:
         shutil.copytree(body_class, folder / body_class.name)
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, "fit", folder, "--goal", goal, "--out", tmp_path / "m.safetensors")
+        run("fit", folder, "--goal", goal, "--out", tmp_path / "m.safetensors")
     told = f"classes: expected at least {2 * n_classes}, one of them"
     assert told in capsys.readouterr().err

@@ -46,14 +46,14 @@ def root(tmp_path_factory):
     return folder
 
 
-def igps(monkeypatch, root, *words):
+def igps(root, *words):
     cache = ["--cache_dir", root.parent / "cache"]
-    run(monkeypatch, *words, *cache, *SMALL)
+    run(*words, *cache, *SMALL)
 
 
-def test_the_table_is_what_python_computes(root, tmp_path, monkeypatch, capsys):
+def test_the_table_is_what_python_computes(root, tmp_path, capsys):
     out = tmp_path / "inside.csv"
-    igps(monkeypatch, root, "inside", root, "--attribute", "ct=ct/{file}", "--out", out)
+    igps(root, "inside", root, "--attribute", "ct=ct/{file}", "--out", out)
     printed = capsys.readouterr().out
     with out.open(newline="") as file:
         rows = {row["part"]: row for row in csv.DictReader(file)}
@@ -80,44 +80,40 @@ def test_the_table_is_what_python_computes(root, tmp_path, monkeypatch, capsys):
 
 def test_rows_are_cached_and_printed_as_json(root, monkeypatch, capsys):
     words = ["inside", root / "rim.nii.gz", "--attribute", f"ct={root}/ct/{{file}}", "--json"]
-    igps(monkeypatch, root, *words)
+    igps(root, *words)
     first = json.loads(capsys.readouterr().out)
     monkeypatch.setattr("igps.analysis.inside_collection.inside_numbers", None)
-    igps(monkeypatch, root, *words)
+    igps(root, *words)
     assert json.loads(capsys.readouterr().out) == first
     assert len(first) == 1
 
 
-def test_one_image_of_two_subjects_and_another_unit_are_remarked(
-    root, tmp_path, monkeypatch, capsys
-):
+def test_one_image_of_two_subjects_and_another_unit_are_remarked(root, tmp_path, capsys):
     for i in range(4):
         write(tmp_path / f"s{i}.nii.gz", (radius(1 + i / 50) < 1).astype(np.uint8))
         shutil.copy(root / "ct" / "rim.nii.gz", tmp_path / f"s{i}_ct.nii.gz")
     write(tmp_path / "s3_ct.nii.gz", (radius(1.0) / 1000).astype(np.float32))
-    igps(monkeypatch, root, "inside", tmp_path, "--attribute", "ct={stem}_ct.nii.gz")
+    igps(root, "inside", tmp_path, "--attribute", "ct={stem}_ct.nii.gz")
     printed = capsys.readouterr().out
     assert "ct of s0.nii.gz and of s1.nii.gz is the same image" in printed
     assert "in s3.nii.gz#s3" in printed
     assert "its unit seems to differ" in printed
 
 
-def test_a_body_of_three_voxels_and_no_attribute_are_refused_with_a_sentence(
-    tmp_path, monkeypatch, capsys
-):
+def test_a_body_of_three_voxels_and_no_attribute_are_refused_with_a_sentence(tmp_path, capsys):
     label = np.zeros(SHAPE, np.uint8)
     label[5:8, 5, 5] = 1
     write(tmp_path / "a.nii.gz", label)
     write(tmp_path / "ct" / "a.nii.gz", radius(1.0).astype(np.float32))
     with pytest.raises(SystemExit):
-        igps(monkeypatch, tmp_path, "inside", tmp_path, "--attribute", "ct=ct/{file}")
+        igps(tmp_path, "inside", tmp_path, "--attribute", "ct=ct/{file}")
     assert "expected at least 8 voxels, got 3" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        igps(monkeypatch, tmp_path, "inside", tmp_path)
+        igps(tmp_path, "inside", tmp_path)
     assert "attribute: expected at least one" in capsys.readouterr().err
 
 
-def test_groups_tests_where_the_signal_lies_beside_shape(tmp_path, monkeypatch, capsys):
+def test_groups_tests_where_the_signal_lies_beside_shape(tmp_path, capsys):
     """Two groups of equal form and equal values, which lie at the rim in one and in the core of the other."""
     random = np.random.default_rng(0)
     for i in range(14):
@@ -129,7 +125,7 @@ def test_groups_tests_where_the_signal_lies_beside_shape(tmp_path, monkeypatch, 
         write(tmp_path / "bodies" / "ct" / f"{i}.nii.gz", image.astype(np.float32))
     words = ["groups", tmp_path / "bodies", "--attribute", "ct=ct/{stem}.nii.gz", "--inside"]
     words += ["--descriptor", "shape_dna", "--n_permutations", 499, "--out", tmp_path / "out"]
-    igps(monkeypatch, tmp_path, *words)
+    igps(tmp_path, *words)
     printed = capsys.readouterr().out
     with (tmp_path / "out" / "groups.csv").open(newline="") as file:
         rows = {row["body"]: row for row in csv.DictReader(file)}
@@ -141,5 +137,5 @@ def test_groups_tests_where_the_signal_lies_beside_shape(tmp_path, monkeypatch, 
     n_numbers = len(column_names(["ct"]))
     assert f"the first of {n_numbers} numbers, q over all of them" in printed
     with pytest.raises(SystemExit):
-        igps(monkeypatch, tmp_path, "groups", tmp_path / "bodies", "--inside")
+        igps(tmp_path, "groups", tmp_path / "bodies", "--inside")
     assert "attribute: expected at least one" in capsys.readouterr().err

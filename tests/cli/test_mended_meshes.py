@@ -62,10 +62,10 @@ def check_notes(path):
         assert found[f"box/{i}.off"].startswith("subdivided from 8 to ")
 
 
-def test_retrieve_says_what_was_mended_from_the_cache_too(root, tmp_path, monkeypatch, capsys):
+def test_retrieve_says_what_was_mended_from_the_cache_too(root, tmp_path, capsys):
     out = tmp_path / "out"
     for _ in range(2):
-        run(monkeypatch, "retrieve", root, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
+        run("retrieve", root, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
         assert capsys.readouterr().out.splitlines()[0] == SUMMARY
         check_notes(out / "notes.csv")
         (out / "notes.csv").unlink()
@@ -75,18 +75,17 @@ def test_retrieve_says_what_was_mended_from_the_cache_too(root, tmp_path, monkey
     for label, height in (("ball", 1.0), ("egg", 2.0)):
         for i in range(2):
             write_clean(clean / label / f"{i}.off", 1 + 0.1 * i, height)
-    run(monkeypatch, "retrieve", clean, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
+    run("retrieve", clean, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
     assert "repaired" not in capsys.readouterr().out
     assert not (out / "notes.csv").exists()
 
 
-def test_extract_and_compare_write_the_same_notes(root, tmp_path, monkeypatch, capsys):
+def test_extract_and_compare_write_the_same_notes(root, tmp_path, capsys):
     cache = ["--cache_dir", tmp_path / "cache"]
-    run(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *cache, *ONE)
+    run("extract", root, "--out", tmp_path / "deep" / "all.npz", *cache, *ONE)
     assert capsys.readouterr().out.splitlines()[0] == SUMMARY
     check_notes(tmp_path / "deep" / "all.notes.csv")
     run(
-        monkeypatch,
         "compare",
         root,
         "--descriptors",
@@ -100,11 +99,11 @@ def test_extract_and_compare_write_the_same_notes(root, tmp_path, monkeypatch, c
     check_notes(tmp_path / "out" / "notes.csv")
 
 
-def test_never_and_always(root, tmp_path, monkeypatch, capsys):
+def test_never_and_always(root, tmp_path, capsys):
     logging.disable(logging.WARNING)
     out = ["--out", tmp_path / "out", "--cache_dir", tmp_path / "cache"]
     try:
-        run(monkeypatch, "retrieve", root, "--mend", "never", *out, *ONE)
+        run("retrieve", root, "--mend", "never", *out, *ONE)
         printed = capsys.readouterr().out
         assert "5 of 8 bodies could not be used." in printed
         assert "repaired" not in printed
@@ -127,7 +126,7 @@ def test_never_and_always(root, tmp_path, monkeypatch, capsys):
             assert error.startswith(str(root))
     finally:
         logging.disable(logging.NOTSET)
-    run(monkeypatch, "retrieve", root, "--mend", "always", *out, *ONE)
+    run("retrieve", root, "--mend", "always", *out, *ONE)
     # What bounds a body without crossing itself is watertight.
     summary = "5 of 8 bodies repaired: 2 welded, 2 subdivided, 1 made watertight"
     assert capsys.readouterr().out.splitlines()[0] == summary
@@ -135,9 +134,9 @@ def test_never_and_always(root, tmp_path, monkeypatch, capsys):
     assert made == {"ball/holed.off"}
 
 
-def test_an_unknown_way_to_mend_is_refused_by_the_command(root, monkeypatch, capsys):
+def test_an_unknown_way_to_mend_is_refused_by_the_command(root, capsys):
     with pytest.raises(SystemExit):
-        run(monkeypatch, "retrieve", root, "--mend", "perhaps", *ONE)
+        run("retrieve", root, "--mend", "perhaps", *ONE)
     error = capsys.readouterr().err
     assert "mend" in error
     for word in ("auto", "never", "always"):
@@ -148,9 +147,9 @@ READS = [name for name in COMMANDS if "mend" in load_command(name).shared_option
 
 
 @pytest.mark.parametrize("command", READS)
-def test_every_command_that_reads_meshes_has_the_choice(command, monkeypatch, capsys):
+def test_every_command_that_reads_meshes_has_the_choice(command, capsys):
     with pytest.raises(SystemExit, match="0"):
-        run(monkeypatch, *command.split(), "--help")
+        run(*command.split(), "--help")
     text = capsys.readouterr().out
     assert "--mend {auto,never,always}" in text
     assert "auto repairs a surface as little as possible" in " ".join(text.split())
@@ -175,7 +174,7 @@ def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
 
     def features(place):
         target = place if command == "retrieve" else place / "all.npz"
-        run(monkeypatch, command, root, "--out", target, "--cache_dir", place / "cache", *ONE)
+        run(command, root, "--out", target, "--cache_dir", place / "cache", *ONE)
         with np.load(place / ("distances.npz" if command == "retrieve" else "all.npz")) as archive:
             return archive["names"].tolist(), archive[
                 "distances" if command == "retrieve" else "features"

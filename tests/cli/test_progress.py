@@ -66,9 +66,7 @@ def bars(text):
     ],
     ids=lambda value: value.split(" ROOT")[0].split(" MESH")[0] if isinstance(value, str) else "",
 )
-def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
-    command, expected, root, tmp_path, monkeypatch, capsys
-):
+def test_a_bar_tells_how_far_it_is_and_what_time_is_left(command, expected, root, tmp_path, capsys):
     """The bars have the names, and the ends that the number of files sets, and they reach them."""
     words = {
         "ROOT": str(root),
@@ -83,7 +81,7 @@ def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
     )
     reads_signatures = not command.startswith("doctor")
     cache = ["--cache_dir", str(tmp_path / "cache")] if reads_signatures else []
-    run(monkeypatch, *line.split(), *cache)
+    run(*line.split(), *cache)
     printed = capsys.readouterr()
     shown = bars(printed.err)
     assert {name for name in expected if name not in shown} == set(), printed.err

@@ -42,17 +42,17 @@ def options(out: Path, *more: object) -> list[object]:
 
 
 @pytest.fixture
-def retrieved(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def retrieved(root: Path, tmp_path: Path) -> Path:
     """Results without a page."""
-    run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(tmp_path / "out"))
+    run("retrieve", root, "--descriptor", INTERIOR, *options(tmp_path / "out"))
     return tmp_path / "out"
 
 
 def test_retrieve_with_its_page(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    run(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(out, "--report"))
+    run("retrieve", root, "--descriptor", INTERIOR, *options(out, "--report"))
     assert capsys.readouterr().out.splitlines()[-1] == f"page of results: {out / 'report.html'}"
     data = data_of(out / "report.html")
     assert [shape["name"] for shape in data["shapes"]] == [
@@ -78,7 +78,7 @@ def test_retrieve_with_its_page(
 
 
 def test_a_page_afterwards_wherever_the_meshes_are(
-    root: Path, retrieved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    root: Path, retrieved: Path, tmp_path: Path
 ) -> None:
     out = retrieved
     page = tmp_path / "pages" / "mine.html"
@@ -86,7 +86,7 @@ def test_a_page_afterwards_wherever_the_meshes_are(
     moved = root.rename(tmp_path / "moved")
 
     def n_pictures(*more: object) -> int:
-        run(monkeypatch, "report", out, "--out", page, "--n_workers", "1", *more)
+        run("report", out, "--out", page, "--n_workers", "1", *more)
         return sum("surface" in shape for shape in data_of(page)["shapes"])
 
     assert n_pictures() == 0
@@ -96,9 +96,9 @@ def test_a_page_afterwards_wherever_the_meshes_are(
     assert len(data_of(page)["shapes"]) == 4
 
 
-def test_compare_has_a_page(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compare_has_a_page(root: Path, tmp_path: Path) -> None:
     descriptors = ["--descriptors", INTERIOR, "own_descriptors:small_gps"]
-    run(monkeypatch, "compare", root, *descriptors, *options(tmp_path / "compare", "--report"))
+    run("compare", root, *descriptors, *options(tmp_path / "compare", "--report"))
     data = data_of(tmp_path / "compare" / "report.html")
     rows = json.loads((tmp_path / "compare" / "compare.json").read_text())
     assert [system["name"] for system in data["systems"]] == [row["descriptor"] for row in rows]
@@ -109,37 +109,34 @@ def test_compare_has_a_page(root: Path, tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_what_is_missing_is_told_before_anything_is_computed(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cache = ["--cache_dir", tmp_path / "cache"]
     for command in ("retrieve", "compare"):
         with pytest.raises(SystemExit, match="1"):
-            run(monkeypatch, command, root, "--report", *cache)
+            run(command, root, "--report", *cache)
         assert "expected --out" in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()
     with pytest.raises(SystemExit, match="1"):
-        run(monkeypatch, "report", tmp_path)
+        run("report", tmp_path)
     assert "no results found" in capsys.readouterr().err
 
 
 def test_sources_of_another_kind_are_refused(
-    retrieved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    retrieved: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for wrong in ('{"format": "other"}', '{"format": "igps-meshes-1"}', "[]", "no JSON"):
         (retrieved / "meshes.json").write_text(wrong)
         with pytest.raises(SystemExit, match="1"):
-            run(monkeypatch, "report", retrieved)
+            run("report", retrieved)
         assert "meshes.json: expected the format igps-meshes-1" in capsys.readouterr().err
 
 
-def test_columns_of_the_labels_reach_the_page(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_columns_of_the_labels_reach_the_page(root: Path, tmp_path: Path) -> None:
     names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(2)]
     rows = [f"{name},{name[:3]},{i}" for i, name in enumerate(names)]
     (root / "labels.csv").write_text("\n".join(["file,label,age", *rows]))
     run(
-        monkeypatch,
         "retrieve",
         root,
         "--descriptor",
@@ -149,9 +146,7 @@ def test_columns_of_the_labels_reach_the_page(
     assert data_of(tmp_path / "out" / "report.html")["columns"] == {"age": ["0", "1", "2", "3"]}
 
 
-def test_bodies_named_by_a_table_elsewhere_have_pictures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bodies_named_by_a_table_elsewhere_have_pictures(tmp_path: Path, here, monkeypatch) -> None:
     nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
     labels[2:8, 3:12, 3:12] = 1
@@ -163,10 +158,8 @@ def test_bodies_named_by_a_table_elsewhere_have_pictures(
             tmp_path / "scans" / f"{subject}.nii.gz",
         )
     (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')
-    monkeypatch.chdir(tmp_path)
     words = ["--classes", "body", "--names", "names.json", "--size", "ignore"]
     run(
-        monkeypatch,
         "retrieve",
         "scans",
         "--descriptor",
@@ -175,7 +168,7 @@ def test_bodies_named_by_a_table_elsewhere_have_pictures(
         *options(tmp_path / "out"),
     )
     monkeypatch.chdir("/")
-    run(monkeypatch, "report", tmp_path / "out", "--n_workers", 1)
+    run("report", tmp_path / "out", "--n_workers", 1)
     names = {f"{subject}.nii.gz#{body}" for subject in range(2) for body in ("block", "bar")}
     shapes = data_of(tmp_path / "out" / "report.html")["shapes"]
     assert {shape["name"] for shape in shapes if "surface" in shape} == names

@@ -124,18 +124,18 @@ def test_a_worker_that_is_killed_costs_nothing(cluster, root, tmp_path):
 
 def test_the_command_and_what_it_says_of_no_scheduler(cluster, root, tmp_path, monkeypatch, capsys):
     words = ["precompute", root, "--cache_dir", tmp_path / "cache", *WORDS]
-    run(monkeypatch, *words, "--cluster", cluster.address)
+    run(*words, "--cluster", cluster.address)
     assert capsys.readouterr().out == "12 of 12 signatures are in the cache; 0 failed\n"
     monkeypatch.setattr(sys.modules[dask_executor.__module__], "_SCHEDULER_TIMEOUT", 1)
     nobody = f"tcp://127.0.0.1:{free_port()}"
     with pytest.raises(SystemExit, match="2"):
-        run(monkeypatch, *words, "--cluster", nobody)
+        run(*words, "--cluster", nobody)
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
     assert "no Dask scheduler answers at tcp://127.0.0.1" in line
     assert len(stored(tmp_path / "cache")) == 12
 
 
-def test_shards_have_all_files_once(root, tmp_path, monkeypatch, capsys):
+def test_shards_have_all_files_once(root, tmp_path, capsys):
     for n in (1, 7, 64, 300):
         numbers = [i for k in range(1, n + 1) for i in of_shard(100, f"{k}/{n}")]
         assert sorted(numbers) == list(range(100))
@@ -144,7 +144,7 @@ def test_shards_have_all_files_once(root, tmp_path, monkeypatch, capsys):
             of_shard(100, wrong)
     words = ["precompute", root, "--cache_dir", tmp_path / "cache", "--n_workers", 1, *WORDS]
     for k, n_there in ((2, 6), (1, 12)):
-        run(monkeypatch, *words, "--shard", f"{k}/2")
+        run(*words, "--shard", f"{k}/2")
         told = f"6 of 6 signatures in shard {k}/2 are in the cache; 0 failed\n"
         assert capsys.readouterr().out == told
         assert len(stored(tmp_path / "cache")) == n_there

@@ -308,9 +308,9 @@ def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path):
     assert 3 < middle / fine < 5.3
 
 
-def test_the_commands(root, cache, tmp_path, monkeypatch, capsys):
+def test_the_commands(root, cache, tmp_path, capsys):
     options = ["--cache_dir", cache, "--n_workers", 1]
-    run(monkeypatch, "duplicates", root, "--out", tmp_path / "out" / "groups.csv", *options)
+    run("duplicates", root, "--out", tmp_path / "out" / "groups.csv", *options)
     lines = capsys.readouterr().out.splitlines()
     assert lines[-3:-1] == ["group 1: bar.obj  bar.off  bar.ply", "group 2: lump.off  lump.stl"]
     assert lines[-1].startswith("5 of 7 files in 2 groups; on generated bodies, this finds ")

@@ -146,13 +146,13 @@ def test_what_cannot_be_described_is_told(root, tmp_path):
         Gallery.build(tmp_path / "none.igps", alone, picky, n_workers=1)
 
 
-def test_a_query_of_a_gallery_is_that_of_its_folder(root, tmp_path, monkeypatch, capsys):
+def test_a_query_of_a_gallery_is_that_of_its_folder(root, tmp_path, capsys):
     index = tmp_path / "gallery.igps"
     cache = ["--cache_dir", tmp_path / "cache"]
     by_name = ["--descriptor", INTERIOR, *cache, *SMALL]
 
     def lines(*arguments):
-        run(monkeypatch, *arguments)
+        run(*arguments)
         return capsys.readouterr().out.splitlines()
 
     built = lines("gallery", "build", root, "--out", index, *by_name)
@@ -183,15 +183,15 @@ def test_what_does_not_fit_is_refused_in_a_sentence(dataset, root, tmp_path, mon
         (["--mend", "never"], 'expected a gallery with reading.mend "never", got "auto"'),
         (["--where", "weight > 3"], columns),
     ):
-        assert words in error_of(monkeypatch, capsys, *query, *options)
+        assert words in error_of(capsys, *query, *options)
     query_in = ["query", mesh, "--gallery"]
-    assert "no such folder" in error_of(monkeypatch, capsys, *query_in, tmp_path / "none.igps")
-    of_meshes = error_of(monkeypatch, capsys, *query_in, root, "--where", "volume > 3")
+    assert "no such folder" in error_of(capsys, *query_in, tmp_path / "none.igps")
+    of_meshes = error_of(capsys, *query_in, root, "--where", "volume > 3")
     assert "where: expected a gallery" in of_meshes
     monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
-    assert "version" in error_of(monkeypatch, capsys, *query)
+    assert "version" in error_of(capsys, *query)
     monkeypatch.undo()
-    gone = error_of(monkeypatch, capsys, "gallery", "sync", tmp_path / "gone", "--gallery", index)
+    gone = error_of(capsys, "gallery", "sync", tmp_path / "gone", "--gallery", index)
     assert "gone: no such folder" in gone
     changed = small_interior()
     next(changed.buffers()).add_(1e-3)
@@ -312,12 +312,12 @@ def test_it_opens_where_it_was_moved_to(dataset, tmp_path):
     assert moved.remove("class = 'egg'") == 3
 
 
-def test_commands_that_change_a_gallery(root, tmp_path, monkeypatch, capsys):
+def test_commands_that_change_a_gallery(root, tmp_path, capsys):
     gallery = tmp_path / "gallery.igps"
     cache = ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
 
     def lines(*arguments):
-        run(monkeypatch, *arguments)
+        run(*arguments)
         return capsys.readouterr().out.splitlines()
 
     lines("gallery", "build", root, "--out", gallery, "--descriptor", INTERIOR, *cache, *SMALL)
@@ -487,31 +487,30 @@ def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
         SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
     )
     words = ["gallery", "build", root, "--descriptor", INTERIOR]
-    told = error_of(monkeypatch, capsys, *words, "--out", root)
+    told = error_of(capsys, *words, "--out", root)
     assert "expected a gallery or a new folder, got a folder with ball" in told
     with_attribute = ["--out", tmp_path / "g", "--attribute", "ct=ct/{file}.nii.gz", "--with", "ct"]
-    told = error_of(monkeypatch, capsys, *words, *with_attribute)
+    told = error_of(capsys, *words, *with_attribute)
     assert "ct: expected centres, got 8 quantiles that are not fitted" in told
 
 
-def test_a_gallery_remembers_the_table_of_names(tmp_path, monkeypatch, capsys):
+def test_a_gallery_remembers_the_table_of_names(tmp_path, here, monkeypatch, capsys):
     """As how files are read; another one may be given, as where it was moved to."""
     save_labels(tmp_path / "scans" / "scan.nii.gz", block_and_bar())
     (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')
     (tmp_path / "other.json").write_text('{"1": "cube", "2": "bar"}')
-    monkeypatch.chdir(tmp_path)
     cache = ["--cache_dir", "cache", "--n_workers", 1]
     build = ["gallery", "build", "scans", "--out", "g.igps", "--descriptor", INTERIOR, *SMALL]
-    run(monkeypatch, *build, "--size", "ignore", "--names", "names.json", *cache)
+    run(*build, "--size", "ignore", "--names", "names.json", *cache)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     cache = ["--cache_dir", "../cache", "--n_workers", 1]
     query = ["query", "../scans/scan.nii.gz#bar", "--gallery", "../g.igps", "--top", 1]
-    run(monkeypatch, *query, *cache)
+    run(*query, *cache)
     assert "scan.nii.gz#bar" in capsys.readouterr().out
     sync_again = ["gallery", "sync", "../scans", "--gallery", "../g.igps", *cache]
-    run(monkeypatch, *sync_again)
+    run(*sync_again)
     assert "0 bodies described, 0 removed" in capsys.readouterr().out
-    run(monkeypatch, *sync_again, "--names", "../other.json")
+    run(*sync_again, "--names", "../other.json")
     assert "1 removed" in capsys.readouterr().out
     assert {row["part"] for row in Gallery("../g.igps").rows("part")} == {"cube", "bar"}

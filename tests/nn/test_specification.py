@@ -31,11 +31,10 @@ def learnable():
     return HistogramDescriptor([one, PairHistogram(["interior_distance"], embedding)], name="mine")
 
 
-def test_a_folder_to_share_has_the_model_and_its_card(tmp_path, monkeypatch):
+def test_a_folder_to_share_has_the_model_and_its_card(tmp_path, here):
     """By the names that hubs of models expect; a folder that is called as a descriptor of the library hides none."""
     descriptor = learnable()
     batch = two_bodies()
-    monkeypatch.chdir(tmp_path)
     for folder in ("shared", "rich"):
         descriptor.save(folder, {"author": "me", "classes": ["cat", "dog"]})
         assert sorted(path.name for path in Path(folder).iterdir()) == [

@@ -811,7 +811,7 @@ def test_the_demo_ends_with_its_page(browser, tmp_path, monkeypatch, capsys):
     """A smaller demo, the last line of which names a page that opens."""
     few = ArticulatedShapes(n_classes=2, n_per_class=2)
     monkeypatch.setattr("igps.shapes.ArticulatedShapes", lambda **_: few)
-    run(monkeypatch, "demo", "--out", tmp_path, "--n_workers", 1)
+    run("demo", "--out", tmp_path, "--n_workers", 1)
     *_, last = capsys.readouterr().out.splitlines()
     path = Path(last.removeprefix("page of results: "))
     assert path == tmp_path / "report.html"

@@ -197,9 +197,8 @@ def run_apart(module, *arguments):
     ],
 )
 def test_a_file_that_is_no_checkpoint_is_named_in_one_sentence(
-    name, message, tmp_path, monkeypatch, capsys
+    name, message, tmp_path, here, monkeypatch, capsys
 ):
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "text.ckpt").write_text("words")
     monkeypatch.setattr(sys, "argv", ["evaluate", name])
     with pytest.raises(SystemExit, match="1"):

@@ -523,13 +523,13 @@ def test_models_whose_number_repeats_are_all_read(tmp_path):
     assert len({molecule.name for molecule in molecules}) == 3
 
 
-def test_completed_residues_are_told_on_the_terminal(tmp_path, monkeypatch, capsys):
+def test_completed_residues_are_told_on_the_terminal(tmp_path, capsys):
     for name, n_residues in (("one", 9), ("two", 12)):
         text = "".join(residue(i, "LYS", backbone()) for i in range(1, n_residues + 1))
         written(tmp_path, text, f"{name}.pdb")
     arguments = ["extract", tmp_path, "--descriptor", "d2", "--out", tmp_path / "out.npz"]
     options = ["--signature.resolution", 8, "--signature.min_samples", 20, "--n_workers", 1]
-    run(monkeypatch, *arguments, *options, "--cache_dir", tmp_path)
+    run(*arguments, *options, "--cache_dir", tmp_path)
     told = "21 residues were completed: balls stand for missing atoms of side chains (in 2 of 2"
     assert told in capsys.readouterr().out
 

@@ -47,14 +47,12 @@ def pair(tmp_path):
     return one, write(tmp_path / "two.pdb", moved, SEQUENCE, first=301)
 
 
-def test_the_turned_part_has_the_paint_in_both_and_structures_are_superposed(
-    pair, tmp_path, monkeypatch
-):
+def test_the_turned_part_has_the_paint_in_both_and_structures_are_superposed(pair, tmp_path):
     out = tmp_path / "out"
     words = ["explain", *pair, "--descriptor", "interior", "--out", out]
     small = ["--signature.resolution", 12, "--signature.max_vertices", 600]
     cache = ["--cache_dir", tmp_path / "cache", "--n_workers", 1, "--signature.min_samples", 0]
-    run(monkeypatch, *words, *small, *cache)
+    run(*words, *small, *cache)
     with (out / "explain_residues.csv").open() as file:
         rows = list(csv.DictReader(file))
     arm = coil()[HINGE:] - coil()[HINGE]

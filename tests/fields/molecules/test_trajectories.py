@@ -64,11 +64,11 @@ def test_each_frame_keeps_places_charges_and_residues(files, tmp_path):
         assert molecule.residue_labels == ("A 1",)
 
 
-def test_the_map_follows_an_opening_hinge(files, tmp_path, monkeypatch):
+def test_the_map_follows_an_opening_hinge(files, tmp_path):
     out = tmp_path / "out"
     small = ["--signature.resolution", "10", "--signature.max_vertices", "500"]
     fast = [*small, "--n_workers", 1, "--cache_dir", tmp_path / "cache", "--descriptor", "d2"]
-    run(monkeypatch, "trajectory", *files, "--select", "all", "--out", out, *fast)
+    run("trajectory", *files, "--select", "all", "--out", out, *fast)
     with (out / "trajectory.csv").open() as file:
         rows = list(csv.DictReader(file))
     found = [int(row["frame"]) for row in rows]
@@ -80,11 +80,11 @@ def test_the_map_follows_an_opening_hinge(files, tmp_path, monkeypatch):
     assert (out / "trajectory.png").is_file()
 
 
-def test_what_cannot_be_read_is_told(files, tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_read_is_told(files, tmp_path, capsys):
     start = ["trajectory", *files, "--out", tmp_path / "out"]
-    told = error_of(monkeypatch, capsys, *start, "--select", "protein and name XX")
+    told = error_of(capsys, *start, "--select", "protein and name XX")
     assert "no atom is selected by 'protein and name XX'" in told
-    told = error_of(monkeypatch, capsys, *start, "--select", "nonsense words")
+    told = error_of(capsys, *start, "--select", "nonsense words")
     assert "not readable with" in told
-    told = error_of(monkeypatch, capsys, "trajectory", files[0], "--out", tmp_path / "out")
+    told = error_of(capsys, "trajectory", files[0], "--out", tmp_path / "out")
     assert "expected a topology and a file of frames" in told

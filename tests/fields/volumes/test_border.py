@@ -53,7 +53,7 @@ def test_each_side_of_an_oblique_image_is_told_with_its_share(axis, end):
     assert border.sides == FRAMELESS[letter]
 
 
-def test_no_whole_body_is_told_and_every_cut_one(tmp_path, monkeypatch, capsys):
+def test_no_whole_body_is_told_and_every_cut_one(tmp_path, capsys):
     """Whole balls one voxel from the border, and balls that a corner or a face cuts by a voxel or more."""
     inner = RADIUS + 0.5
     whole = {f"whole{i}": (inner, N - 1 - inner, 16.0 + i) for i in range(3)}
@@ -63,7 +63,7 @@ def test_no_whole_body_is_told_and_every_cut_one(tmp_path, monkeypatch, capsys):
         nibabel.save(image, tmp_path / f"{name}.nii.gz")
     out = tmp_path / "table.csv"
     words = ["--descriptor", "measures", "--cache_dir", tmp_path / "cache", "--n_workers", 1]
-    run(monkeypatch, "extract", tmp_path, "--out", out, *words)
+    run("extract", tmp_path, "--out", out, *words)
     table = pd.read_csv(out, keep_default_na=False).set_index("part")
     assert dict(table["border_sides"]) == {
         "corner": "LPI",
@@ -74,14 +74,14 @@ def test_no_whole_body_is_told_and_every_cut_one(tmp_path, monkeypatch, capsys):
     expected = [name in cut for name in table.index]
     assert (table["at_border"] > 0).tolist() == expected
     capsys.readouterr()
-    run(monkeypatch, "extract", tmp_path, "--out", out, "--complete", *words)
+    run("extract", tmp_path, "--out", out, "--complete", *words)
     assert "3 of 6 bodies at the border of the image, left out" in capsys.readouterr().out
     assert set(pd.read_csv(out)["part"]) == set(whole)
-    run(monkeypatch, "doctor", tmp_path, "--out", out, "--n_workers", 1)
+    run("doctor", tmp_path, "--out", out, "--n_workers", 1)
     found = pd.read_csv(out, keep_default_na=False).set_index("name")
     assert found.loc["corner.nii.gz#corner", "border_sides"] == "LPI"
     assert found.loc["whole0.nii.gz#whole0", "at_border"] == ""
     for name in whole:
         (tmp_path / f"{name}.nii.gz").unlink()
-    line = error_of(monkeypatch, capsys, "extract", tmp_path, "--out", out, "--complete", *words)
+    line = error_of(capsys, "extract", tmp_path, "--out", out, "--complete", *words)
     assert "all of 3 bodies reach the border of their image" in line
