@@ -62,13 +62,6 @@ def here(tmp_path):
 
 
 @pytest.fixture
-def here(tmp_path):
-    """The folder of the test as the current one."""
-    with contextlib.chdir(tmp_path):
-        yield tmp_path
-
-
-@pytest.fixture
 def on_path(tmp_path, monkeypatch):
     """A folder on the Python path."""
     monkeypatch.syspath_prepend(tmp_path)
