@@ -7,8 +7,7 @@ from pathlib import Path
 
 from outcome import Row
 
-TESTS = Path(__file__).parents[1]
-sys.path += [str(TESTS), str(TESTS / "gallery")]
+sys.path.append(str(Path(__file__).parents[1] / "gallery"))
 from test_table import killed_writers
 
 
