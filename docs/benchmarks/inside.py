@@ -2,6 +2,7 @@
 
 python -m docs.benchmarks.inside patterns
 python -m docs.benchmarks.inside power
+python -m docs.benchmarks.inside joint
 python -m docs.benchmarks.inside hippocampi FOLDER
 """
 
@@ -41,6 +42,7 @@ _N_NEAREST = 24  # vertices that move a point inside with them
 _N_WAVES = 50  # of a field of lumps
 _WAVELENGTH = 0.4  # about twice the length of a lump; a quadruped is about 2.5 long
 _N_DRAWS_OF_NUMBERS = 20  # draws in which each number is tested by itself
+_N_PERMUTATIONS = 499  # of joint tests
 _NOISE = 0.5  # of each body's own lumps, in standard deviations of its signal
 
 
@@ -187,17 +189,7 @@ def power(n_bodies: int = 200, n_each: int = 30, n_draws: int = 400, seed: int =
         n_draws: draws of two groups.
         seed: seed of bodies and draws.
     """
-    chosen = _class()
-    rows: dict[str, list[Floats]] = {"none": [], "values": [], "bodies": [], "shifted bodies": []}
-    for number in range(n_bodies):
-        subject = Subject.draw(chosen, [seed, number])
-        signature, points, rest = subject.posed(0)
-        lumps = subject.lumps(points)
-        rim = subject.signal("rim", points, rest)
-        own = 0.25 * np.random.default_rng([seed, number, 5]).normal()
-        for name, strength in zip(rows, (0.0, 0.5, own, own + 0.125), strict=True):
-            rows[name].append(numbers_of(signature, lumps + strength * rim))
-    tables = {name: np.array(table) for name, table in rows.items()}
+    tables = _tables_of_groups(n_bodies, seed)
     for first, second in (("none", "none"), ("none", "values"), ("bodies", "shifted bodies")):
         random = np.random.default_rng([seed, 6])
         found = []
@@ -211,6 +203,75 @@ def power(n_bodies: int = 200, n_each: int = 30, n_draws: int = 400, seed: int =
             f"{first} against {second}: PERMANOVA {shares[0]:.3f}, kernel {shares[1]:.3f}, "
             f"any number with q <= {LEVEL} {shares[2]:.3f}, x.rim.contrast alone {shares[3]:.3f}"
         )
+
+
+def _tables_of_groups(n_bodies: int, seed: int) -> dict[str, Floats]:
+    """Return the numbers (n_bodies, columns) of the same bodies with each signal of `power`."""
+    chosen = _class()
+    rows: dict[str, list[Floats]] = {"none": [], "values": [], "bodies": [], "shifted bodies": []}
+    for number in range(n_bodies):
+        subject = Subject.draw(chosen, [seed, number])
+        signature, points, rest = subject.posed(0)
+        lumps = subject.lumps(points)
+        rim = subject.signal("rim", points, rest)
+        own = 0.25 * np.random.default_rng([seed, number, 5]).normal()
+        for name, strength in zip(rows, (0.0, 0.5, own, own + 0.125), strict=True):
+            rows[name].append(numbers_of(signature, lumps + strength * rim))
+    return {name: np.array(table) for name, table in rows.items()}
+
+
+def joint(n_bodies: int = 200, n_each: int = 30, n_draws: int = 400, seed: int = 2) -> None:
+    """Print how often several joint tests tell groups apart that differ by half a standard deviation between bodies.
+
+    Args:
+        n_bodies: bodies in the pool from which both groups are drawn.
+        n_each: bodies of a group.
+        n_draws: draws of two groups.
+        seed: seed of bodies; another one than that of `power`.
+    """
+    tables = _tables_of_groups(n_bodies, seed)
+    free = [i for i, name in enumerate(COLUMNS) if not has_unit(name)]
+    signs = np.repeat([1.0, -1.0], n_each)
+    for first, second in (("none", "none"), ("bodies", "shifted bodies")):
+        random = np.random.default_rng(6)
+        rejected: dict[str, list[bool]] = {}
+        for _ in range(n_draws):
+            drawn = random.permutation(n_bodies)[: 2 * n_each]
+            pair = tables[first][drawn[:n_each]], tables[second][drawn[n_each:]]
+            rows = standard_scores(np.vstack(pair)[:, free])
+            groups = [signs, *(random.permutation(signs) for _ in range(_N_PERMUTATIONS))]
+            for name, values in joint_statistics(rows, np.array(groups)).items():
+                is_found = np.mean(values >= values[0] - 1e-12) <= LEVEL
+                rejected.setdefault(name, []).append(bool(is_found))
+        shares = ", ".join(f"{name} {np.mean(found):.3f}" for name, found in rejected.items())
+        print(f"{first} against {second}: {shares}")
+
+
+def joint_statistics(rows: Floats, groups: Floats) -> dict[str, Floats]:
+    """Return statistics (P,) by name of rows (N, D), for groups (P, N) of signs; larger tells of a difference."""
+    n = len(rows)
+    names = [name for name in COLUMNS if not has_unit(name)]
+    shift = groups @ rows * 2 / n  # of the means
+    variance = (np.square(rows).sum(axis=0) - n / 4 * np.square(shift)) / (n - 2)
+    t = shift / np.sqrt(variance * 4 / n)
+    at_rim = [i for i, name in enumerate(names) if ".rim." in name]
+    _, axes = np.linalg.eigh(rows.T @ rows)
+    scores = rows @ axes[:, -1]
+    return {
+        "sum of squares": np.square(shift).sum(axis=1),
+        "largest t": np.abs(t).max(axis=1),
+        "Hotelling, all": _hotelling(rows, shift),
+        "Hotelling, rim": _hotelling(rows[:, at_rim], shift[:, at_rim]),
+        "first principal component": np.abs(groups @ scores),
+        "rim.contrast": np.abs(t[:, names.index("x.rim.contrast")]),
+    }
+
+
+def _hotelling(rows: Floats, shift: Floats) -> Floats:
+    """Return Hotelling's T² up to a factor, with a ridge of a tenth of the mean variance."""
+    covariance = rows.T @ rows / len(rows)
+    precision = np.linalg.inv(covariance + 0.1 * np.eye(len(covariance)))
+    return np.einsum("pi,ij,pj->p", shift, precision, shift)
 
 
 def rejections(rows: Floats, n_each: int, seed: int, has_numbers: bool) -> list[float]:
@@ -290,4 +351,4 @@ def areas_under_curve(
 
 if __name__ == "__main__":
     with errors_as_messages():
-        auto_cli([patterns, power, hippocampi])
+        auto_cli([patterns, power, joint, hippocampi])
