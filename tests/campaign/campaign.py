@@ -24,7 +24,7 @@ _AMOUNTS = {
     "broken_bodies": (3_000, 90),
     "changed_streams": (2_000, 20),
     "kills": (200, 8),
-    "gallery_kills": (200, 8),
+    "gallery_kills": (60, 8),
     "machine_faults": (0, None),
     "properties": (12, 1),
 }

@@ -123,15 +123,6 @@ def test_compiled_equals_eager(batch):
     )
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_cuda_equals_cpu(batch):
-    descriptor = learned()
-    expected = gradients(descriptor, batch, list(descriptor.parameters()))
-    descriptor.cuda()
-    result = gradients(descriptor, batch.to("cuda"), list(descriptor.parameters()))
-    assert_close([value.cpu() for value in result], list(expected), rtol=1e-3, atol=1e-6)
-
-
 def test_cells_are_counted_by_part(batch):
     descriptor = combined()
     assert descriptor(batch).shape == (2, sum(descriptor.part_cells))

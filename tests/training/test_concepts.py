@@ -202,15 +202,3 @@ def test_potential_is_least_in_the_middle(tmp_path, drawn):
     (star,) = [line for line in panel.get_lines() if line.get_marker() == "*"]
     assert_allclose(star.get_xydata()[0], centre, atol=1e-6)
     assert imread(tmp_path / "potential.png").std() > 0.05
-
-
-def test_upright_turns_without_mirroring():
-    points = np.random.default_rng(0).normal(size=(200, 3)) * [1, 4, 2]
-    turned = concepts.upright(points)
-    frame = np.linalg.lstsq(points, turned, rcond=None)[0]
-    expected = np.eye(3)
-    assert_allclose(frame.T @ frame, expected, atol=1e-9)
-    assert np.linalg.det(frame) == pytest.approx(1)
-    # The longest axis is up, and not upside down.
-    assert frame[1, 1] > 0.95
-    assert frame[2, 0] > 0.95

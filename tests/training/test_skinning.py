@@ -7,73 +7,10 @@ from scipy.spatial.transform import Rotation
 from training.shapes.kinds import KINDS
 from training.shapes.rigging import bones_at_rest, limb_rig
 from training.shapes.rods import Binding, Rig, Rod, bend, bind, rod_motions
-from training.shapes.skinning import (
-    Motions,
-    compose,
-    motion,
-    normalized,
-    product,
-    rotations_about,
-    transform,
-)
 
 from igps.shapes.skeleton import Part, Skeleton, limb
 from igps.shapes.solids import Blob
 from igps.shapes.templates import TEMPLATES
-
-g = np.random.default_rng(0)
-POINTS = g.normal(size=(50, 3))
-
-
-def scalar_first(rotation):
-    return rotation.as_quat()[..., [3, 0, 1, 2]]
-
-
-def test_products_are_those_of_rotations():
-    a = Rotation.random(20, rng=1)
-    b = Rotation.random(20, rng=2)
-    found = product(scalar_first(a), scalar_first(b))
-    expected = scalar_first(a * b)
-    expected *= np.sign((found * expected).sum(axis=1, keepdims=True))
-    assert_allclose(found, expected, atol=1e-14)
-
-
-def test_a_motion_turns_and_then_moves():
-    turns = Rotation.random(50, rng=3)
-    steps = g.normal(size=(50, 3))
-    found = transform(motion(scalar_first(turns), steps), POINTS)
-    expected = turns.apply(POINTS) + steps
-    assert_allclose(found, expected, atol=1e-13)
-
-
-def test_a_turn_about_a_point_leaves_it_where_it_is():
-    vectors = g.normal(size=(50, 3))
-    centres = g.normal(size=(50, 3))
-    turns = rotations_about(centres, vectors)
-    assert_allclose(transform(turns, centres), centres, atol=1e-13)
-    expected = Rotation.from_rotvec(vectors).apply(POINTS - centres) + centres
-    assert_allclose(transform(turns, POINTS), expected, atol=1e-13)
-    still = rotations_about(centres, np.zeros((50, 3)))
-    assert_allclose(transform(still, POINTS), POINTS, atol=1e-15)
-
-
-def test_one_motion_after_another():
-    first = rotations_about(g.normal(size=(50, 3)), g.normal(size=(50, 3)))
-    second = rotations_about(g.normal(size=(50, 3)), g.normal(size=(50, 3)))
-    found = transform(compose(first, second), POINTS)
-    expected = transform(first, transform(second, POINTS))
-    assert_allclose(found, expected, atol=1e-13)
-
-
-def test_a_blend_is_rigid_and_half_way_between():
-    """Of a rotation and no motion about the same point: half the angle."""
-    axis = np.array([0.0, 0.0, 1.0])
-    centre = np.array([1.0, 2.0, 3.0])
-    a = rotations_about(centre, 0.0 * axis)
-    b = rotations_about(centre, 1.6 * axis)
-    half = normalized(Motions(0.5 * (a.real + b.real), 0.5 * (a.dual + b.dual)))
-    expected = Rotation.from_rotvec(0.8 * axis).apply(POINTS - centre) + centre
-    assert_allclose(transform(half, POINTS), expected, atol=1e-13)
 
 
 def cylinder(length, radius):

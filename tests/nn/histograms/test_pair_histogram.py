@@ -435,14 +435,6 @@ def test_half_precision_and_autocast_count_in_single(device, cosines):
     assert_close(gradients[1:], expected_gradients[1:], rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-@pytest.mark.parametrize("name", CASES)
-def test_cuda_equals_cpu(batch, name):
-    histogram = PairHistogram(CASES[name][0](), SpectralEmbedding(n_eigenpairs=6))
-    expected = histogram(batch)
-    assert_close(histogram.cuda()(batch.to("cuda")).cpu(), expected, rtol=0, atol=1e-6)
-
-
 def test_impossible_histograms_are_refused():
     with pytest.raises(
         ValueError, match=r"axes: expected one of potential, interior_distance, .*got 'depth'"

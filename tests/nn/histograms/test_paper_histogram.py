@@ -103,10 +103,3 @@ def test_half_precision_is_counted_in_single(cloud):
 def test_bad_layout_is_refused(cloud, name, value):
     with pytest.raises(ValueError, match=f"{name}: expected .*, got {value}"):
         pair_histogram(*cloud, **{name: value})
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_cuda_equals_cpu(cloud):
-    embedding, potential = (values.float() for values in cloud)
-    on_device = pair_histogram(embedding.cuda(), potential.cuda()).cpu()
-    assert_allclose(on_device, pair_histogram(embedding, potential), atol=1e-6)
