@@ -5,12 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from torch.testing import assert_close
 
 from igps.retrieval import euclidean, rerank, rerank_candidates, retrieval_scores, search
+from igps.retrieval.reranking import jaccard_distances
 
 
-def by_hand(distances, k, n_expanded, share):
+def by_hand(distances, k, n_expanded):
     """Zhong, Zheng, Cao and Li 2017, equations 2, 3, 7, 10, 11 and 12; the units of distance are this library's."""
     n = len(distances)
     ranked = []
@@ -32,15 +34,13 @@ def by_hand(distances, k, n_expanded, share):
         row = [math.exp(-distances[i][j] / near) if j in members else 0.0 for j in range(n)]
         weights.append([value / sum(row) for value in row])
     expanded = [np.mean([weights[m] for m in order[:n_expanded]], axis=0) for order in ranked]
-    mean = sum(map(sum, distances)) / (n * (n - 1))
     found = [[0.0] * n for _ in range(n)]
     for i in range(n):
         for j in range(n):
             if i != j:
                 smaller = np.minimum(expanded[i], expanded[j]).sum()
                 larger = np.maximum(expanded[i], expanded[j]).sum()
-                jaccard = 1 - smaller / larger
-                found[i][j] = (1 - share) * jaccard + share * distances[i][j] / mean
+                found[i][j] = 1 - smaller / larger
     return found
 
 
@@ -49,23 +49,29 @@ def points():
     return torch.randn(30, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-@pytest.mark.parametrize(("k", "n_expanded", "share"), [(6, 3, 0.3), (9, 1, 0.0), (12, 4, 0.5)])
-def test_sets_and_sums_of_the_paper(k, n_expanded, share, points):
-    distances = euclidean(points, points)
-    expected = torch.tensor(by_hand(distances.tolist(), k, n_expanded, share), dtype=torch.float64)
-    found = rerank(distances, k, n_expanded, share, keep_nearest=False)
-    assert_close(found, expected, atol=1e-10, rtol=0)
+@pytest.mark.parametrize(("k", "n_expanded"), [(6, 3), (9, 1), (12, 4), (20, 6)])
+def test_sets_and_sums_of_the_paper(k, n_expanded, points):
+    distances = euclidean(points, points).numpy()
+    expected = by_hand(distances.tolist(), k, n_expanded)
+    assert_allclose(jaccard_distances(distances, k, n_expanded), expected, atol=1e-10)
 
 
 def test_a_shape_is_its_own_nearest_among_equals(points):
     """Three copies of each of four, and one of the others; the nearest of a copy is itself, then the next copies."""
     repeated = torch.cat([points[:8], points[:4], points[:4]])
     distances = euclidean(repeated, repeated)
-    distances = (distances + distances.T) / 2
+    distances = ((distances + distances.T) / 2).numpy()
     for k in (3, 5):
-        expected = torch.tensor(by_hand(distances.tolist(), k, 1, 0.3), dtype=torch.float64)
-        found = rerank(distances, k, 1, 0.3, keep_nearest=False)
-        assert_close(found, expected, atol=1e-10, rtol=0)
+        found = jaccard_distances(distances, k, 1)
+        assert_allclose(found, by_hand(distances.tolist(), k, 1), atol=1e-10)
+
+
+def mixed(distances):
+    """The mean of Jaccard distances and those before, by the paper's weight, before the nearest are put first."""
+    before = distances.double().numpy()
+    mean = before.sum() / (len(before) * (len(before) - 1))
+    found = 0.7 * jaccard_distances(before) + 0.3 * before / mean
+    return torch.from_numpy(found).to(distances).fill_diagonal_(0)
 
 
 @pytest.mark.parametrize(("n_copies", "dtype"), [(0, torch.float32), (8, torch.float64)])
@@ -76,7 +82,7 @@ def test_the_nearest_stays_the_nearest(n_copies, dtype):
     own = euclidean(points, points).to(dtype).fill_diagonal_(0)
     own = torch.minimum(own, own.T)
     found = rerank(own)
-    moved = rerank(own, keep_nearest=False)
+    moved = mixed(own)
     assert_close(found, found.T, rtol=0, atol=0)
     alone = own.clone().fill_diagonal_(torch.inf)
     for i, row in enumerate(found.clone().fill_diagonal_(torch.inf)):
@@ -86,7 +92,7 @@ def test_the_nearest_stays_the_nearest(n_copies, dtype):
     nearest = torch.zeros_like(own, dtype=torch.bool).scatter_(1, alone.argmin(1)[:, None], True)
     if not n_copies:  # among equals, which is the nearest is not told
         rest = ~(nearest | nearest.T).fill_diagonal_(True)
-        alone = rerank(own, keep_nearest=False)
+        alone = mixed(own)
         assert_close(found[rest], alone[rest], rtol=0, atol=0)
         assert found[nearest].max() < found[rest].min()
 
@@ -154,16 +160,14 @@ def test_few_shapes_and_equal_ones():
 
 
 @pytest.mark.parametrize(
-    ("distances", "numbers", "message"),
+    ("distances", "message"),
     [
-        (np.zeros((3, 3)), {}, "distances: expected a tensor, got ndarray"),
-        (torch.zeros(2, 3), {}, r"expected \(N, N\), of a collection to itself, got \(2, 3\)"),
-        (-torch.ones(2, 2), {}, "finite numbers ≥ 0"),
-        (torch.full((2, 2), math.nan), {}, "finite numbers ≥ 0"),
-        (torch.zeros(2, 2), {"n_neighbours": 0}, "n_neighbours: expected at least 1, got 0"),
-        (torch.zeros(2, 2), {"share": 1.5}, "share: expected 0 to 1, got 1.5"),
+        (np.zeros((3, 3)), "distances: expected a tensor, got ndarray"),
+        (torch.zeros(2, 3), r"expected \(N, N\), of a collection to itself, got \(2, 3\)"),
+        (-torch.ones(2, 2), "finite numbers ≥ 0"),
+        (torch.full((2, 2), math.nan), "finite numbers ≥ 0"),
     ],
 )
-def test_what_it_refuses(distances, numbers, message):
+def test_what_it_refuses(distances, message):
     with pytest.raises(ValueError, match=message):
-        rerank(distances, **numbers)
+        rerank(distances)

@@ -1,58 +1,46 @@
 """Re-ranking: new distances of a collection from the neighbours that shapes have in common, without labels."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import torch
 from scipy import sparse
 from torch import Tensor
 
-from igps._arrays import Booleans, Floats, Integers
-from igps._compiled import compiled
-from igps._parameters import check_at_least
+from igps._arrays import Floats, Integers
 from igps.retrieval.distances import Distance, check_tensor
 from igps.retrieval.ranking import SearchResult, rank
 
 N_RERANKED = 200
 """Number of nearest entries of a single query that are re-ranked, by their neighbourhoods among each other."""
 
+# The numbers of the paper: the k of its neighbourhoods, the shapes over which weights are averaged, the shape itself
+# included, and the weight of the distances before, in units of their mean.
+_N_NEIGHBOURS = 20
+_N_EXPANDED = 6
+_SHARE = 0.3
 _TINY = np.finfo(np.float64).tiny
 
 
-def rerank(
-    distances: Tensor,
-    n_neighbours: int = 20,
-    n_expanded: int = 6,
-    share: float = 0.3,
-    *,
-    keep_nearest: bool = True,
-) -> Tensor:
+def rerank(distances: Tensor) -> Tensor:
     """Re-rank a collection by k-reciprocal neighbours: shapes with common neighbours become closer.
 
-    The neighbourhood of a shape consists of those of its k nearest shapes that have the shape among
-    their own k nearest. The neighbourhood of a member, for k/2, is added if two thirds of it are in
-    the neighbourhood already. Members have weights exp(−d), with d in units of the mean distance to
-    the k nearest. These weights are averaged over the nearest shapes. The new distance of two shapes
-    is the Jaccard distance of their weighted neighbourhoods, mixed with the distance before.
-    Source: Zhong, Zheng, Cao and Li 2017.
+    The new distance of two shapes is their `jaccard_distances`, mixed with the distance before. Source: Zhong, Zheng,
+    Cao and Li 2017.
 
-    The result depends on the whole collection: without one of the shapes, the others may rank
-    differently. Common neighbours indicate the class of a shape rather than its body, so each shape
-    keeps its nearest one.
+    The result depends on the whole collection: without one of the shapes, the others may rank differently. Common
+    neighbours indicate the class of a shape rather than its body, so each shape keeps its nearest one: unlike in the
+    paper, all pairs in which one shape is the nearest of the other come before all other pairs, in their order.
 
     Args:
         distances: (N, N) of a collection to itself, ≥ 0. The mean of both triangles counts.
-        n_neighbours: k, at most N − 1.
-        n_expanded: number of nearest shapes, the shape itself included, over which weights are averaged.
-        share: weight of the distances before, in units of their mean, in the result.
-        keep_nearest: put all pairs in which one shape is the nearest of the other before all other
-            pairs, in their original order; the paper does not do so.
 
     Returns:
         (N, N) distances ≥ 0, symmetric, 0 on the diagonal; without unit.
 
     Raises:
-        ValueError: the distances are not such a matrix, or an argument is out of range.
+        ValueError: the distances are not such a matrix.
     """
     check_tensor("distances", distances)
     if distances.ndim != 2 or distances.shape[0] != distances.shape[1]:
@@ -61,34 +49,42 @@ def rerank(
         )
     if not bool((distances >= 0).all() and torch.isfinite(distances).all()):
         raise ValueError("distances: expected finite numbers ≥ 0, got others.")
-    check_at_least(1, n_neighbours=n_neighbours, n_expanded=n_expanded)
-    if not 0 <= share <= 1:
-        raise ValueError(f"share: expected 0 to 1, got {share}.")
     n = len(distances)
     if n < 2:
         return torch.zeros_like(distances)
     before = distances.detach().double().cpu().numpy()
     before = (before + before.T) / 2
     np.fill_diagonal(before, 0)
-    n_neighbours = min(n_neighbours, n - 1)
-    n_expanded = min(n_expanded, n)
-    order = _nearest_first(before, max(n_neighbours + 1, n_expanded))
-    weights = _neighbourhoods(before, order, n_neighbours, n_expanded)
-    common = np.zeros((n, n))
-    members = weights.tocsc()
-    add_common_weights(
-        (weights.indptr, weights.indices, weights.data),
-        (members.indptr, members.indices, members.data),
-        common,
-    )
-    # Rows of weights sum to 1, so that the larger weights of two rows sum to 2 minus the smaller ones.
-    jaccard = np.maximum(1 - common / (2 - common), 0)
     mean = max(before.sum() / (n * (n - 1)), _TINY)
-    after = (1 - share) * jaccard + share * before / mean
-    if keep_nearest:
-        _put_first(after, before, _is_nearest(order))
+    after = (1 - _SHARE) * jaccard_distances(before) + _SHARE * before / mean
+    _put_nearest_first(after, before)
     np.fill_diagonal(after, 0)
     return torch.from_numpy(after).to(distances)
+
+
+def jaccard_distances(
+    distances: Floats, n_neighbours: int = _N_NEIGHBOURS, n_expanded: int = _N_EXPANDED
+) -> Floats:
+    """Return the Jaccard distances (N, N) of the neighbourhoods of shapes, from symmetric distances (N, N).
+
+    The neighbourhood of a shape consists of those of its k nearest shapes that have the shape among their own k
+    nearest. The neighbourhood of a member, for k/2, is added if two thirds of it are in the neighbourhood already.
+    Members have weights exp(−d), with d in units of the mean distance to the k nearest. These weights are averaged over
+    the nearest shapes, `n_expanded` with the shape itself.
+    """
+    n = len(distances)
+    n_neighbours = min(n_neighbours, n - 1)
+    n_expanded = min(n_expanded, n)
+    order = _nearest_first(distances, max(n_neighbours + 1, n_expanded))
+    columns = _neighbourhoods(distances, order, n_neighbours, n_expanded).tocsc()
+    # The sums of the smaller weights of two shapes, column by column: only shapes with a common member meet
+    common = np.zeros((n, n))
+    for start, end in pairwise(columns.indptr):
+        shapes = columns.indices[start:end]
+        weights = columns.data[start:end]
+        common[np.ix_(shapes, shapes)] += np.minimum.outer(weights, weights)
+    # Weights of a shape sum to 1, so that the larger weights of two shapes sum to 2 minus the smaller ones
+    return np.maximum(1 - common / (2 - common), 0)
 
 
 def rerank_candidates(
@@ -151,9 +147,7 @@ def _neighbourhoods(
     weights = sparse.csr_array((similarity, (rows, columns)), shape=(n, n))
     expansion = _binary(order[:, :n_expanded])
     factors = sparse.diags_array(1 / (n_expanded * weights.sum(axis=1)))
-    averaged = sparse.csr_array(expansion @ factors @ weights)
-    averaged.sort_indices()
-    return averaged
+    return sparse.csr_array(expansion @ factors @ weights)
 
 
 def _binary(neighbours: Integers) -> sparse.csr_array:
@@ -170,43 +164,14 @@ def _reciprocal(neighbours: Integers) -> sparse.csr_array:
     return ones.multiply(ones.T).tocsr()
 
 
-@compiled()
-def add_common_weights(
-    rows: tuple[Integers, Integers, Floats],
-    columns: tuple[Integers, Integers, Floats],
-    common: Floats,
-) -> None:
-    """Add to `common` (N, N) the sums of the smaller weights of each pair of rows of a sparse matrix.
-
-    Only weights in the same column meet, so that few pairs of rows have to be compared.
-
-    Args:
-        rows, columns: starts, indices and weights of the matrix in CSR and in CSC form.
-        common: the sums.
-    """
-    row_starts, row_indices, row_weights = rows
-    column_starts, column_indices, column_weights = columns
-    for i in range(len(common)):
-        for e in range(row_starts[i], row_starts[i + 1]):
-            column = row_indices[e]
-            for f in range(column_starts[column], column_starts[column + 1]):
-                j = column_indices[f]
-                common[i, j] += min(row_weights[e], column_weights[f])
-
-
-def _is_nearest(order: Integers) -> Booleans:
-    """Return (N, N) whether one of two shapes is the nearest of the other."""
-    n = len(order)
-    is_nearest = np.zeros((n, n), dtype=bool)
-    is_nearest[np.arange(n), order[:, 1]] = True
-    return is_nearest | is_nearest.T
-
-
-def _put_first(after: Floats, before: Floats, is_first: Booleans) -> None:
-    """Change distances in place so that some pairs come before all others, in their order before."""
-    is_other = ~is_first & (after > 0)
-    smallest = after.min(where=is_other, initial=np.inf)
+def _put_nearest_first(after: Floats, before: Floats) -> None:
+    """Change distances in place: pairs of a shape and its nearest come before all others, in their order before."""
+    nearest = _nearest_first(before, 2)[:, 1]
+    is_first = np.zeros(before.shape, dtype=bool)
+    is_first[np.arange(len(before)), nearest] = True
+    is_first |= is_first.T
+    smallest = after.min(where=~is_first & (after > 0), initial=np.inf)
     limit = smallest if np.isfinite(smallest) else 1.0
     largest = max(before[is_first].max(), _TINY)
-    # At most half of the smallest other value, so that rounding to single precision makes no ties.
+    # At most half of the smallest other value, so that rounding to single precision makes no ties
     after[is_first] = 0.5 * limit * before[is_first] / largest
