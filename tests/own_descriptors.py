@@ -29,6 +29,14 @@ SMALL = [
 SMALL += ["--signature.n_surface_samples", "60", "--n_workers", "1"]
 
 
+def changed(descriptor, **numbers):
+    """Return a descriptor with other numbers than the published ones."""
+    for name, number in numbers.items():
+        assert hasattr(descriptor, name)
+        setattr(descriptor, name, number)
+    return descriptor
+
+
 class Height(igps.BodyDescriptor):
     """Describes a mesh by its height, and fails in the given way on the mesh named `bad`."""
 

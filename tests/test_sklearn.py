@@ -21,11 +21,12 @@ from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.signature.signature import SignatureConfig
 from igps.sklearn import VolumetricFeatures
+from own_descriptors import changed
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=12, min_samples=0, n_surface_samples=20)
 # For the many fits of scikit-learn's own checks.
 TINY = SignatureConfig(n_eigenpairs=3, resolution=4, min_samples=0, n_surface_samples=20)
-DISTANCES = D2(n_bins=8)
+DISTANCES = changed(D2(), n_bins=8)
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,14 @@ import torch
 from commands import error_of, run
 from igps.analysis.asymmetry import asymmetries, find_pairs
 from igps.data.sources import Bodies
+from igps.mesh.loading import BodyRef
+
+
+def bodies_called(names):
+    """Bodies of files FILE and of parts FILE#PART."""
+    split = [name.partition("#") for name in names]
+    refs = tuple(BodyRef(Path(file), part or None) for file, _, part in split)
+    return Bodies(refs, tuple(names))
 
 
 @pytest.mark.parametrize(
@@ -28,8 +36,7 @@ from igps.data.sources import Bodies
 )
 def test_names_that_differ_by_a_side_alone_are_a_pair(left, right, subject, structure):
     names = (right, "s1.nii.gz#liver", "s1.nii.gz#leftover", left)
-    parts = tuple(name.partition("#")[2] or None for name in names)
-    (pair,) = find_pairs(Bodies(tuple(map(Path, names)), names, None, parts))
+    (pair,) = find_pairs(bodies_called(names))
     assert pair.subject == subject
     assert pair.structure == structure
     assert pair.left == 3
@@ -38,7 +45,7 @@ def test_names_that_differ_by_a_side_alone_are_a_pair(left, right, subject, stru
 
 def test_files_that_are_named_by_their_sides_are_pairs_of_their_subjects():
     names = ("1_left.ply", "1_right.ply", "2_left.ply", "2_right.ply", "3_left.ply")
-    pairs = find_pairs(Bodies(tuple(map(Path, names)), names))
+    pairs = find_pairs(bodies_called(names))
     assert [(pair.structure, pair.left, pair.right) for pair in pairs] == [
         ("all", 0, 1),
         ("all", 2, 3),
@@ -62,8 +69,7 @@ def test_the_odd_pair_comes_first_and_cut_ones_are_not_judged():
         for organ in ("kidney", "hip")
         for side in ("left", "right")
     ]
-    parts = tuple(name.partition("#")[2] for name in names)
-    pairs = find_pairs(Bodies(tuple(map(Path, names)), tuple(names), None, parts))
+    pairs = find_pairs(bodies_called(names))
     assert len(pairs) == 16
     places = random.normal(size=(32, 3))
     places[1::2] = places[::2] + 0.1 * (1 + 0.05 * random.normal(size=(16, 1)))

@@ -10,7 +10,7 @@ from igps.descriptors import descriptor
 from igps.descriptors.literature.d2 import D2
 from igps.retrieval import retrieval_scores
 from igps.signature.signature import SignatureConfig
-from own_descriptors import Broken, Height, Slow, write_egg
+from own_descriptors import Broken, Height, Slow, changed, write_egg
 
 KEYS = ["descriptor", "nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map"]
 KEYS += ["seconds_per_mesh", "n_models", "invariant_to"]
@@ -142,7 +142,7 @@ def test_two_of_one_name_are_refused(dataset):
     with pytest.raises(
         ValueError, match=r"descriptors: expected different names, got d2 more than once"
     ):
-        next(compare(dataset, [D2(), Height(), D2(n_bins=8)], progress=False))
+        next(compare(dataset, [D2(), Height(), changed(D2(), n_bins=8)], progress=False))
 
 
 def test_collection_without_classes_is_refused(root):

@@ -1,4 +1,4 @@
-"""A gallery of a million bodies: `python tests/benchmarks/million.py [--n N] [--folder FOLDER] [--seed SEED]`.
+"""A gallery of a million bodies: `PYTHONPATH=. python tests/benchmarks/million.py`, with `--n`, `--folder`, `--seed`.
 
 600 generated bodies of 12 classes are described by `pretrained`. A row is a mixture of four bodies of a class with a
 little of any other body and noise. The script prints the cost of building the gallery, and the time and the recall at
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from training.shapes.templates import TEMPLATES
 
 import igps
 from igps.gallery.gallery import CANDIDATES
@@ -85,7 +86,7 @@ class Rows:
 
 
 def _describe_bodies(folder, out):
-    shapes = igps.ArticulatedShapes(n_classes=N_CLASSES, n_per_class=50, n_vertices=700)
+    shapes = igps.ArticulatedShapes(N_CLASSES, 50, n_vertices=700, templates=TEMPLATES)
     shapes.write(folder / "meshes")
     descriptor = igps.descriptor("pretrained")
     dataset = igps.SignatureDataset(

@@ -723,7 +723,7 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["clusters", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
         (
             ["retrieve", "ROOT", "--with", "ct=-1"],
-            "with: expected NAME or NAME=WEIGHT with a weight above 0, such as",
+            "descriptor: expected +NAME or +NAME=WEIGHT after the name of a descriptor, such as +ct=0.5",
         ),
         (
             ["classify", "ROOT", "--model", "plain.safetensors"],

@@ -6,7 +6,6 @@ import torch
 import trimesh
 from bodies_on_disk import write_body
 
-from igps.data.batch import SignatureBatch
 from igps.data.datamodule import Batches, SignatureDataModule
 from igps.data.splits import Parts
 from igps.mesh.errors import MeshError
@@ -76,24 +75,19 @@ def test_training_shapes_are_kept_in_memory_thinned(root, tmp_path, n_samples):
         assert len(list(module.train_dataloader())) == 1
 
 
-def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(root, tmp_path):
+def test_workers_read_the_same_batches(root, tmp_path):
     cache = tmp_path / "cache"
     one = SignatureDataModule(root, FEW, config=CONFIG, cache_dir=cache, n_workers=1)
-    other = SignatureDataModule(
-        root, FEW, Batches(n_evaluated=4), CONFIG, cache_dir=cache, n_loading_workers=2
-    )
+    other = SignatureDataModule(root, FEW, config=CONFIG, cache_dir=cache, n_loading_workers=2)
     one.prepare_data()
     other.prepare_data()
     (whole,) = one.test_dataloader()
-    parts = list(other.test_dataloader())
-    assert [len(part) for part in parts] == [4, 4, 1]
-    assert sum((part.ids for part in parts), ()) == whole.ids
-    assert torch.equal(SignatureBatch.concatenate(parts).interior.points, whole.interior.points)
+    (read,) = other.test_dataloader()
+    assert read.ids == whole.ids
+    assert torch.equal(read.interior.points, whole.interior.points)
 
 
 def test_batches_of_nothing_are_refused():
-    with pytest.raises(ValueError, match="n_evaluated: expected at least 1, got 0"):
-        Batches(n_evaluated=0)
     with pytest.raises(ValueError, match="n_samples: expected at least 2, got -3"):
         Batches(n_samples=-3)
 
@@ -113,8 +107,6 @@ def test_needs_classes(root):
 def test_impossible_protocols_are_refused(root):
     with pytest.raises(ValueError, match="protocol: expected one of seen, unseen, got 'some'"):
         SignatureDataModule(root, Parts("some"))
-    with pytest.raises(ValueError, match="n_test: expected None with protocol 'seen'"):
-        SignatureDataModule(root, Parts(n_test=2))
 
 
 def test_meshes_are_read_as_asked(root, tmp_path):

@@ -10,6 +10,7 @@ import igps
 from igps.descriptors import NAMES
 from igps.descriptors.literature.d2 import D2
 from igps.signature.signature import SignatureConfig
+from own_descriptors import changed
 
 FOURTEEN = (
     "interior",
@@ -33,6 +34,7 @@ import numpy as np
 
 import igps
 from igps.descriptors.literature.d2 import D2
+from own_descriptors import changed
 
 
 class Roundness(igps.BodyDescriptor):
@@ -46,10 +48,10 @@ class Roundness(igps.BodyDescriptor):
 
 
 def coarse():
-    return D2(n_bins=8)
+    return changed(D2(), n_bins=8)
 
 
-ready = D2(n_bins=16)
+ready = changed(D2(), n_bins=16)
 number = 5
 
 
@@ -81,7 +83,7 @@ def test_a_wrong_name_lists_all():
 
 
 def test_an_object_is_itself():
-    mine = D2(n_bins=3)
+    mine = changed(D2(), n_bins=3)
     assert igps.descriptor(mine) is mine
 
 
@@ -97,10 +99,10 @@ def test_own_class_function_and_object_by_import_path(own, blob):
     expected = pytest.approx(blob.volume / blob.area**1.5)
     assert found == expected
     found = made["coarse"](batch)
-    expected = D2(n_bins=8)(batch)
+    expected = changed(D2(), n_bins=8)(batch)
     torch.testing.assert_close(found, expected)
     found = made["ready"](batch)
-    expected = D2(n_bins=16)(batch)
+    expected = changed(D2(), n_bins=16)(batch)
     torch.testing.assert_close(found, expected)
     assert igps.descriptor(f"{own}:ready") is made["ready"]
 

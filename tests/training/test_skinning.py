@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 from training.shapes.kinds import KINDS
 from training.shapes.rigging import bones_at_rest, limb_rig
 from training.shapes.rods import Binding, Rig, Rod, bend, bind, rod_motions
+from training.shapes.templates import TEMPLATES
 
 from igps.shapes.skeleton import Part, Skeleton, limb
 from igps.shapes.solids import Blob
-from igps.shapes.templates import TEMPLATES
 
 
 def cylinder(length, radius):

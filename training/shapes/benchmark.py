@@ -18,7 +18,7 @@ from igps._parameters import check_at_least
 from igps.failures import Failed
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
-from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder
+from igps.shapes.benchmark import off_text, shapes_folder
 from training.shapes.bodies import Body, Pose, draw_body, draw_pose
 from training.shapes.individuals import individual
 from training.shapes.kinds import LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, BodyClass, body_classes
@@ -203,7 +203,7 @@ class GradedShapes:
             **({"individuals": True} if self.n_individuals else {}),
         )
         names = self.names
-        missing = [i for i, name in enumerate(names) if not is_whole_off(folder / f"{name}.off")]
+        missing = [i for i, name in enumerate(names) if not (folder / f"{name}.off").exists()]
         # A job has all missing poses of a body, so that the body is drawn once.
         jobs: dict[int, list[int]] = {}
         for i in missing:

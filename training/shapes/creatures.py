@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from igps.shapes.skeleton import DOWN, ORIGIN, Part, Skeleton, aim, circle, limb, turned
-from igps.shapes.solids import Blob, Box, Cone, Ring, Shell, Solid
+from igps.shapes.solids import Blob, Box, Cone, Shell, Solid
 from training.shapes.limbs import LimbStyle, ending
 from training.shapes.polygons import Frame, Prism
+from training.shapes.ring import Ring
 
 
 def star(g: np.random.Generator, core: str, n: int, kind: str, end: str) -> Skeleton:

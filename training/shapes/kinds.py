@@ -11,11 +11,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from igps.shapes.skeleton import Skeleton
-from igps.shapes.templates import TEMPLATES
 from training.shapes.artefacts import stack, table, tongs, tool, vessel, wheel
 from training.shapes.creatures import beast, chain, comb, serpent, star, tree
 from training.shapes.plates import MACHINES, SHEETS, machine, sheet
 from training.shapes.springs import coil
+from training.shapes.templates import TEMPLATES
 
 Motion = Literal["limbs", "hinges", "sheet", "rigid"]
 

@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from igps._arrays import Floats
 from igps.shapes.skeleton import ORIGIN, UP, Part, aim, circle, limb
-from igps.shapes.solids import Arc, Blob, Box, Cone, Ring, Shell, Solid, Vector
+from igps.shapes.solids import Arc, Blob, Box, Cone, Shell, Solid, Vector
 from training.shapes.polygons import Prism
+from training.shapes.ring import Ring
 
 
 def ending(

@@ -10,8 +10,9 @@ import numpy as np
 
 from igps._arrays import Floats
 from igps.shapes.skeleton import Part, Skeleton, circle, turned
-from igps.shapes.solids import Cone, Ring, Shell, Solid, Vector
+from igps.shapes.solids import Cone, Shell, Solid, Vector
 from training.shapes.polygons import Prism
+from training.shapes.ring import Ring
 
 Bar = tuple[float, float, float, float, float, float]
 Hole = tuple[float, float, float]

@@ -99,9 +99,8 @@ def _with_attributes(
 ) -> dict[str, Any]:
     """Return the option for the descriptor, or descriptors, with attributes behind each name."""
     from igps.descriptors import NAMES
-    from igps.descriptors.registry import attributes_suffix
 
-    suffix = attributes_suffix(attributes)
+    suffix = "".join(f"+{attribute}" for attribute in attributes)
     parameters = inspect.signature(command.function).parameters
     if "descriptors" in parameters:
         names = options.get("descriptors") or parameters["descriptors"].default or NAMES

@@ -11,7 +11,7 @@ from typing import Any, overload
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._pytree import MappingKey, register_pytree_node
+from torch.utils._pytree import MappingKey, register_pytree_node, tree_map_only
 
 from igps._arrays import Floats, Singles
 from igps.data.indices import Indices, resolve_indices, scalar_index
@@ -42,10 +42,8 @@ class SampleBatch:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SampleBatch:
         """Return the batch with a function applied to each of its tensors."""
-        attributes = {name: function(values) for name, values in self.attributes.items()}
-        return SampleBatch(
-            function(self.points), function(self.eigenfunctions), function(self.mask), attributes
-        )
+        mapped: SampleBatch = tree_map_only(Tensor, function, self)
+        return mapped
 
     def to(
         self, device: torch.device | str | torch.dtype, non_blocking: bool = False
@@ -212,16 +210,8 @@ class SignatureBatch:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SignatureBatch:
         """Return the batch with a function applied to each of its tensors."""
-        return replace(
-            self,
-            eigenvalues=function(self.eigenvalues),
-            interior=self.interior.map(function),
-            surface=self.surface.map(function),
-            area=function(self.area),
-            volume=function(self.volume),
-            labels=function(self.labels),
-            measures=None if self.measures is None else function(self.measures),
-        )
+        mapped: SignatureBatch = tree_map_only(Tensor, function, self)
+        return mapped
 
     def to(
         self, device: torch.device | str | torch.dtype, non_blocking: bool = False
@@ -355,8 +345,11 @@ def _unflatten(values: Iterable[Any], aside: _Aside) -> SignatureBatch:
 
 
 def _flatten_samples(samples: SampleBatch) -> tuple[list[Any], None]:
-    tensors = samples.points, samples.eigenfunctions, samples.mask
-    return [*tensors, dict(samples.attributes)], None
+    return [samples.points, samples.eigenfunctions, samples.mask, dict(samples.attributes)], None
+
+
+def _named(names: Sequence[str], values: Sequence[Any]) -> list[tuple[MappingKey[str, Any], Any]]:
+    return [(MappingKey(name), value) for name, value in zip(names, values, strict=True)]
 
 
 # For `torch.export.export(descriptor, (batch,))` and `torch.func`. These two entries in PyTorch's table of containers
@@ -369,25 +362,19 @@ register_pytree_node(
     to_dumpable_context=lambda aside: "",
     from_dumpable_context=lambda text: _Aside(),
     flatten_with_keys_fn=lambda batch: (
-        [
-            (MappingKey(name), value)
-            for name, value in zip((*_TENSORS, "measures"), _flatten(batch)[0], strict=True)
-        ],
+        _named((*_TENSORS, "measures"), _flatten(batch)[0]),
         _flatten(batch)[1],
     ),
 )
 register_pytree_node(
     SampleBatch,
     _flatten_samples,
-    lambda values, _: SampleBatch(*values),
+    lambda tensors, _: SampleBatch(*tensors),
     serialized_type_name="igps.SampleBatch",
     to_dumpable_context=lambda _: "",
     from_dumpable_context=lambda _: None,
     flatten_with_keys_fn=lambda samples: (
-        [
-            (MappingKey(name), value)
-            for name, value in zip(_SAMPLE_TENSORS, _flatten_samples(samples)[0], strict=True)
-        ],
+        _named(_SAMPLE_TENSORS, _flatten_samples(samples)[0]),
         None,
     ),
 )

@@ -5,7 +5,7 @@ import logging
 import os
 import time
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -54,8 +54,8 @@ class Cache:
     """Cache of records by key, which any number of processes can share.
 
     Files are written atomically, so a reader sees a whole file or none. Partial files of killed processes are removed
-    after a day, see `remove_abandoned`. Processes that compute the same value write the same bytes. Permissions follow
-    the umask. The directory is created if it is missing.
+    after a day, when another file is written beside them. Processes that compute the same value write the same bytes.
+    Permissions follow the umask. The directory is created if it is missing.
     """
 
     def __init__(self, directory: str | Path, kind: Kind) -> None:
@@ -113,7 +113,7 @@ class Cache:
         path = self.path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         texts = {**record.texts, "format": _FORMAT, "key": key, "checksum": checksum(record)}
-        _remove_abandoned(path.parent.glob(f"*{PARTIAL}"))
+        _remove_abandoned(path.parent)
         # safetensors writes the memory of arrays, so they must be contiguous
         arrays = {name: np.ascontiguousarray(values) for name, values in record.arrays.items()}
         try:
@@ -128,10 +128,6 @@ class Cache:
                 raise
             # The error for a full disk names no file
             raise OSError(error.errno, error.strerror, str(path)) from error
-
-    def remove_abandoned(self) -> None:
-        """Remove partial files of killed processes that are older than a day."""
-        _remove_abandoned(self.directory.glob(f"*/*{PARTIAL}"))
 
 
 def encode(signature: Signature) -> Record:
@@ -155,39 +151,23 @@ def decode(record: Record) -> Signature:
     config: dict[str, Any] = json.loads(record.texts["config"])
     if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
         raise ValueError("computed by another version of the algorithm")
-    eigenvalues = record.arrays["eigenvalues"]
-    _check_array("eigenvalues", eigenvalues, np.float64, (len(eigenvalues),))
     fields: dict[str, Any] = {name: json.loads(record.texts[name]) for name in _SCALAR_FIELDS}
     fields["notes"] = tuple(fields["notes"])
     for kind in SAMPLE_KINDS:
-        fields[kind] = _decode_samples(record.arrays, kind, len(eigenvalues))
-    return Signature(eigenvalues, config=SignatureConfig(**config), **fields)
+        prefix = f"{kind}.attributes."
+        attributes = {
+            name.removeprefix(prefix): values
+            for name, values in record.arrays.items()
+            if name.startswith(prefix)
+        }
+        points = record.arrays[f"{kind}.points"]
+        fields[kind] = Samples(points, record.arrays[f"{kind}.eigenfunctions"], attributes)
+    return Signature(record.arrays["eigenvalues"], config=SignatureConfig(**config), **fields)
 
 
-def _decode_samples(arrays: Mapping[str, NDArray[Any]], kind: str, n_eigenpairs: int) -> Samples:
-    points = arrays[f"{kind}.points"]
-    _check_array(f"{kind}.points", points, np.float64, (len(points), 3))
-    functions = arrays[f"{kind}.eigenfunctions"]
-    _check_array(f"{kind}.eigenfunctions", functions, np.float32, (len(points), n_eigenpairs))
-    prefix = f"{kind}.attributes."
-    attributes = {}
-    for name, values in arrays.items():
-        if name.startswith(prefix):
-            _check_array(name, values, np.float32, (len(points), *values.shape[1:]))
-            attributes[name.removeprefix(prefix)] = values
-    return Samples(points, functions, attributes)
-
-
-def _check_array(
-    name: str, values: NDArray[Any], dtype: type[np.floating[Any]], shape: tuple[int, ...]
-) -> None:
-    if values.dtype != dtype or values.shape != shape:
-        expected = f"{dtype.__name__} {shape}"
-        raise ValueError(f"{name}: expected {expected}, got {values.dtype} {values.shape}")
-
-
-def _remove_abandoned(partials: Iterable[Path]) -> None:
-    for partial in partials:
+def _remove_abandoned(folder: Path) -> None:
+    """Remove partial files of killed processes that are older than a day."""
+    for partial in folder.glob(f"*{PARTIAL}"):
         try:
             if time.time() - partial.stat().st_mtime > _ABANDONED_AGE:
                 partial.unlink()

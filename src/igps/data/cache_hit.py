@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from igps.data.keys import FileDigest, derived_key
+from igps.data.keys import derived_key
 
 
 @dataclass(frozen=True)
@@ -13,7 +13,6 @@ class CacheHit:
 
     key: str  # of the Signature
     attributes: Mapping[str, str] = field(default_factory=dict)  # keys of added attributes, by name
-    files: tuple[FileDigest, ...] = ()  # that were read to find the key
     notes: tuple[str, ...] = ()  # on how the mesh was changed
     unit: str | None = None  # of length
     measures: Mapping[str, float] = field(default_factory=dict)  # plain numbers, by name

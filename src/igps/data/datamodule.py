@@ -20,6 +20,8 @@ from igps.data.transforms import FewerSamples
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
+_N_EVALUATED = 16  # shapes in a batch of validation and test
+
 
 def has_configuration() -> bool:
     """Return whether Lightning's command line creates an object from a configuration, which checkpoints can store."""
@@ -35,17 +37,14 @@ class Batches:
         n_classes, n_per_class: P and K of a training batch, in each process.
         n_samples: size of the fixed random subsets of interior and surface samples of each training shape that are kept
             in memory. If None, whole signatures are read from the cache at each step.
-        n_evaluated: number of shapes in a batch of validation and test.
     """
 
     n_classes: int = 10
     n_per_class: int = 4
     n_samples: int | None = 1000
-    n_evaluated: int = 16
 
     def __post_init__(self) -> None:
         check_at_least(2, n_samples=self.n_samples)
-        check_at_least(1, n_evaluated=self.n_evaluated)
 
 
 class SignatureDataModule(LightningDataModule):
@@ -145,7 +144,7 @@ class SignatureDataModule(LightningDataModule):
 
     def _evaluation_loader(self, indices: Sequence[int]) -> DataLoader[LabelledSignature]:
         part = self.dataset.subset(indices)
-        return self._loader(part, self.batches.n_evaluated, None, self.n_loading_workers)
+        return self._loader(part, _N_EVALUATED, None, self.n_loading_workers)
 
     def _loader(
         self, part: SignatureDataset, batch_size: int, sampler: Sampler[int] | None, n_workers: int

@@ -103,10 +103,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         sources, self._functions = split_attributes(attributes)
         meshes: Mapping[BodyRef, Mesh | MeshError] = {}
         if isinstance(root_or_paths, Mapping):
-            (root_or_paths, meshes), labels = (
-                bodies_in_memory(root_or_paths, labels, reading, config),
-                None,
-            )
+            root_or_paths, meshes = bodies_in_memory(root_or_paths, labels, reading, config)
+            labels = None  # of objects; those of bodies are known
         directory = Path(cache_dir or default_cache_dir())
         bodies = bodies_of(root_or_paths, labels, reading, sources.values(), directory)
         self.bodies = bodies.with_classes(classes or "folder")
@@ -215,25 +213,21 @@ class SignatureDataset(Dataset[LabelledSignature]):
             return [None] * len(self)
         return [None if hit is None else hit.whole_key for hit in self._find_hits()]
 
-    def notes(self, index: int) -> tuple[str, ...]:
-        """Return the notes on how a mesh was changed before its cached Signature was computed."""
-        return self.subset([index]).all_notes()[0]
-
     def all_notes(self) -> list[tuple[str, ...]]:
-        """Return the notes of all meshes. After `precompute`, files are not read again."""
-        return [() if hit is None else hit.notes for hit in self._find_hits()]
+        """Return the notes on how each mesh was changed. After `precompute`, files are not read again."""
+        return [() if header is None else header.notes for header in self._headers()]
 
     def units(self) -> list[str | None]:
         """Return the unit of length of each body; None if it is unknown, or there is no cached Signature."""
-        if self._loaded is not None:
-            return [signature.unit for signature in self._loaded]
-        return [None if hit is None else hit.unit for hit in self._find_hits()]
+        return [None if header is None else header.unit for header in self._headers()]
 
     def measures(self) -> list[Mapping[str, float]]:
         """Return the plain numbers of each body by name, see `igps.measures`; none without a cached Signature."""
-        if self._loaded is not None:
-            return [signature.measures for signature in self._loaded]
-        return [{} if hit is None else hit.measures for hit in self._find_hits()]
+        return [{} if header is None else header.measures for header in self._headers()]
+
+    def _headers(self) -> Sequence[Signature | CacheHit | None]:
+        """Return what holds the notes, the unit and the measures of each body; None if that is not known."""
+        return self._find_hits() if self._loaded is None else self._loaded
 
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
         """Return a batch of some of the items, optionally with their meshes."""

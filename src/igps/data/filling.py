@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Sequence
@@ -11,15 +12,12 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 from igps._parallel import run
 from igps._progress import Progress
 from igps._text import counted
 from igps._threads import n_cores
-from igps.data.cache import Kind
 from igps.data.cache_hit import CacheHit
-from igps.data.keys import FileDigest
 from igps.data.known_files import KnownFiles
 from igps.data.pipeline import SignaturePipeline, fill_elsewhere, version
 from igps.data.sources import Bodies
@@ -30,7 +28,6 @@ from igps.mesh.loading import BodyRef
 
 logger = logging.getLogger(__name__)
 
-_RECORDS_PER_WRITE = 1000  # to the database of `KnownFiles`
 _MAX_BODIES_PER_JOB = 64  # each job reads the file again, and its results arrive together
 _MAX_DELAY = 60.0  # seconds until a shared file system shows a file that another machine wrote
 
@@ -80,10 +77,7 @@ def fill(
     except OSError as error:
         cause = f"cache_dir: {pipeline.cache_dir} cannot be created ({error.strerror})"
         raise MachineError(f"{cause}. Choose a writable folder and run again.") from error
-    for kind in get_args(Kind):
-        pipeline.cache(kind).remove_abandoned()
-    known = KnownFiles(pipeline.cache_dir)
-    found = find_cached(pipeline, bodies, read_files=executor is None)
+    found = find_cached(pipeline, bodies)
     hits = [None if isinstance(outcome, Failed) else outcome for outcome in found]
     failures: dict[int, Failure] = {}
     missing = [i for i, outcome in enumerate(found) if outcome is None]
@@ -103,69 +97,48 @@ def fill(
     )
     n_found = len(bodies) - len(missing)
     bar = Progress(total=len(bodies), initial=n_found, desc="signatures", disable=not progress)
-    new: list[FileDigest] = []
     is_visible = False
     with bar, contextlib.closing(outcomes):
-        try:
-            for i, outcome in outcomes:
-                bar.update()
-                if isinstance(outcome, Failed):
-                    fail(i, outcome)
-                    continue
-                if not is_visible:
-                    wait_until_visible(pipeline, outcome)
-                    is_visible = True
-                hits[i] = outcome
-                new += outcome.files
-                if len(new) >= _RECORDS_PER_WRITE:
-                    known.remember(new)
-                    new.clear()
-        finally:
-            known.remember(new)
-    _warn_of_left_out(failures.values())
+        for i, outcome in outcomes:
+            bar.update()
+            if isinstance(outcome, Failed):
+                fail(i, outcome)
+                continue
+            if not is_visible:
+                wait_until_visible(pipeline, outcome)
+                is_visible = True
+            hits[i] = outcome
+    line = left_out(failure.summary for failure in failures.values())
+    if line:
+        logger.warning("%s", line)
     return hits, [failures[i] for i in sorted(failures)]
 
 
-def _warn_of_left_out(failures: Iterable[Failure]) -> None:
-    line = left_out(failure.summary for failure in failures)
-    if line:
-        logger.warning("%s", line)
-
-
-def find_cached(
-    pipeline: SignaturePipeline, bodies: Bodies, read_files: bool = True
-) -> list[CacheHit | Failed | None]:
-    """Return the cache entry of each body, or why it could not be used before; None if neither is known.
-
-    Files that are new or changed are read only if `read_files`.
-    """
+def find_cached(pipeline: SignaturePipeline, bodies: Bodies) -> list[CacheHit | Failed | None]:
+    """Return the cache entry of each body, or why it could not be used before; None if neither is known."""
     found: list[CacheHit | Failed | None] = [None] * len(bodies)
-    for i, body in enumerate(bodies):
-        if body in pipeline.meshes:
+    groups = _groups(pipeline, bodies, range(len(bodies)))
+    files: list[Path] = []
+    if not pipeline.meshes:
+        for group in groups:
             with contextlib.suppress(MeshError):  # which the computation reports
-                found[i] = pipeline.find(body, pipeline.content(body))
-    on_disk = [i for i, body in enumerate(bodies) if body not in pipeline.meshes]
-    groups = group_by_file(bodies, on_disk)
-    files: dict[Path, list[Path]] = {}
+                files += dependencies_of(bodies.paths[group[0]], pipeline.reading)
+    known = KnownFiles(pipeline.cache_dir).digests(files)
     for group in groups:
-        path = bodies.paths[group[0]]
-        with contextlib.suppress(MeshError):  # which the computation reports
-            files[path] = dependencies_of(path, pipeline.reading)
-    database = KnownFiles(pipeline.cache_dir)
-    known = database.unchanged(file for paths in files.values() for file in paths)
-    new: list[FileDigest] = []
-    for group in groups:
-        path = bodies.paths[group[0]]
-        is_known = path in files and all(file in known for file in files[path])
-        if not (is_known or read_files):
-            continue
         with contextlib.suppress(MeshError):  # which the computation reports
             content = pipeline.content(bodies[group[0]], known)
-            new += [file for file in content.files if file.path not in known]
             for i in group:
                 found[i] = pipeline.find(bodies[i], content)
-    database.remember(new)
     return found
+
+
+def _groups(
+    pipeline: SignaturePipeline, bodies: Bodies, indices: Sequence[int], max_size: int | None = None
+) -> list[list[int]]:
+    """Group the indices of bodies by what they are read from: a file, or a mesh in memory."""
+    if pipeline.meshes:
+        return [[i] for i in indices]
+    return group_by_file(bodies, indices, max_size)
 
 
 def compute(
@@ -176,52 +149,37 @@ def compute(
     n_workers: int | None,
     executor: Executor | None,
     limits: Limits,
-    max_per_job: int | None = None,
 ) -> Generator[tuple[int, CacheHit | Failed], None, None]:
     """Compute Signatures into the cache, and yield the index and the cache entry or failure of each body.
 
-    A job computes several bodies of one file, which it reads once. If the process of a job dies, each of its bodies is
-    tried again in a job of its own. With limits, which are those of one body, each job has one body. `max_per_job` is
-    64 if None, or less so that all workers have a job. See `igps._parallel.run` for the other arguments.
+    A job computes several bodies of one file, which it reads once: at most 64, and so few that all workers have a job.
+    If the process of a job dies, each of its bodies is tried again in a job of its own. With limits, which are those of
+    one body, each job has one body. See `igps._parallel.run` for the other arguments.
     """
-    per_worker = -(-len(indices) // (n_workers or n_cores()))
-    max_per_job = (
-        1 if limits != Limits() else max_per_job or max(1, min(per_worker, _MAX_BODIES_PER_JOB))
-    )
-    groups = group_by_file(bodies, indices, max_per_job)
-    jobs = [[bodies[i] for i in group] for group in groups]
     function: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
+    refs = bodies.refs
     if executor is not None:  # its workers may run in another folder, so all paths must be absolute
-        function = partial(
-            fill_elsewhere,
-            replace(pipeline, cache_dir=pipeline.cache_dir.absolute()).fill,
-            version(),
-        )
-        jobs = [
-            [b if b in pipeline.meshes else replace(b, path=b.path.absolute()) for b in job]
-            for job in jobs
-        ]
-    lost: list[int] = []
-    results = run(function, jobs, n_workers=n_workers, executor=executor, limits=limits)
-    with contextlib.closing(results):
-        for job_index, outcome in results:
-            group = groups[job_index]
-            if not isinstance(outcome, Failed):
-                yield from zip(group, outcome, strict=True)
-            elif len(group) > 1:
-                lost += group
-            else:
-                yield group[0], outcome
-    if lost:
-        yield from compute(
-            pipeline,
-            bodies,
-            lost,
-            n_workers=n_workers,
-            executor=executor,
-            limits=limits,
-            max_per_job=1,
-        )
+        absolute = replace(pipeline, cache_dir=pipeline.cache_dir.absolute())
+        function = partial(fill_elsewhere, absolute.fill, version())
+        if not pipeline.meshes:
+            refs = tuple(replace(ref, path=ref.path.absolute()) for ref in refs)
+    n_each = math.ceil(len(indices) / (n_workers or n_cores()))
+    n_each = 1 if limits != Limits() else min(n_each, _MAX_BODIES_PER_JOB)
+    groups = _groups(pipeline, bodies, indices, n_each)
+    while groups:
+        jobs = [[refs[i] for i in group] for group in groups]
+        lost: list[list[int]] = []
+        results = run(function, jobs, n_workers=n_workers, executor=executor, limits=limits)
+        with contextlib.closing(results):
+            for number, outcome in results:
+                group = groups[number]
+                if not isinstance(outcome, Failed):
+                    yield from zip(group, outcome, strict=True)
+                elif len(group) > 1:
+                    lost += [[i] for i in group]
+                else:
+                    yield group[0], outcome
+        groups = lost
 
 
 def wait_until_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:

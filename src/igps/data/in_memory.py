@@ -43,7 +43,5 @@ def bodies_in_memory(
         except MeshError as error:
             meshes[BodyRef(Path(name))] = error
         classes += [] if labels is None else [labels[i]] * (len(meshes) - n_before)
-    paths, parts = zip(*((ref.path, ref.part) for ref in meshes), strict=True)
-    return Bodies(
-        paths, tuple(map(str, meshes)), None if labels is None else tuple(classes), parts
-    ), meshes
+    names = tuple(map(str, meshes))
+    return Bodies(tuple(meshes), names, None if labels is None else tuple(classes)), meshes

@@ -33,8 +33,22 @@ class KnownFiles:
     def __init__(self, cache_dir: Path) -> None:
         self._path = cache_dir / _FILE
 
-    def unchanged(self, paths: Iterable[Path]) -> dict[Path, FileDigest]:
-        """Return the digests of those files that are known and have not changed."""
+    def digests(self, paths: Iterable[Path]) -> dict[Path, FileDigest]:
+        """Return the digests of files, which are read only if they are new or have changed.
+
+        Files that cannot be read are left out.
+        """
+        unique = dict.fromkeys(paths)
+        found = self._unchanged(unique)
+        new = {}
+        for path in unique:
+            if path not in found:
+                with contextlib.suppress(OSError):
+                    new[path] = FileDigest.of(path)
+        self._remember(new.values())
+        return found | new
+
+    def _unchanged(self, paths: Iterable[Path]) -> dict[Path, FileDigest]:
         found: dict[Path, FileDigest] = {}
         if not self._path.exists():
             return found
@@ -49,14 +63,14 @@ class KnownFiles:
                         found[path] = FileDigest(path, stat_key(path), digest)
         return found
 
-    def remember(self, files: Iterable[FileDigest]) -> None:
+    def _remember(self, files: Iterable[FileDigest]) -> None:
         """Record digests, except for files that were changed just now."""
         now = time.time_ns()
-        rows = {
+        rows = [
             (os.path.abspath(file.path), *file.stamp, file.digest)
             for file in files
             if now - max(file.stamp[1:]) > MIN_AGE
-        }
+        ]
         if not rows:
             return
         with self._tolerate_errors(), contextlib.closing(self._database()) as database, database:

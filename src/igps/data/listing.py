@@ -34,7 +34,10 @@ class Listing:
                     several[path] = dependencies_of(path, self.options)
             except MeshError:
                 continue
-        known = self._known(several.values())
+        known: dict[Path, FileDigest] = {}
+        if self.cache_dir is not None:
+            files = (file for group in several.values() for file in group)
+            known = KnownFiles(self.cache_dir).digests(files)
         for path, files in several.items():
             if all(file in known for file in files):
                 content = Content.of_files([known[file] for file in files])
@@ -42,21 +45,6 @@ class Listing:
             else:
                 listed[path], _ = _read(path, self.options)
         return listed
-
-    def _known(self, groups: Iterable[list[Path]]) -> dict[Path, FileDigest]:
-        """Return the digests of files, which are read only if they are new or have changed."""
-        if self.cache_dir is None:
-            return {}
-        files = dict.fromkeys(file for group in groups for file in group)
-        database = KnownFiles(self.cache_dir)
-        known = database.unchanged(files)
-        new = {}
-        for file in files:
-            if file not in known:
-                with contextlib.suppress(OSError):  # which the computation reports
-                    new[file] = FileDigest.of(file)
-        database.remember(new.values())
-        return known | new
 
     def _cached(self, path: Path, content: Content) -> list[BodyRef]:
         """Return the bodies of a file from the cache, where they are stored if they were missing."""

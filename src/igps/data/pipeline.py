@@ -175,56 +175,55 @@ class SignaturePipeline:
             return cached
         return replace(self, needs_cache=False)._compute(body, content)
 
-    def hit(self, body: BodyRef, content: Content, mesh: Mesh | None = None) -> CacheHit:
-        """Return the cache entry of a body, computed if missing; raise a MeshError if the body cannot be used."""
-        found = self.find(body, content)
-        if isinstance(found, Failed):
-            raise MeshError(found.reason)
-        if found is None:
-            signature = self._compute(body, content, mesh)
-            found = replace(
-                self._keys(body, content),
-                notes=tuple(signature.notes),
-                unit=signature.unit,
-                measures=signature.measures,
-            )
-        return found
-
     def fill(self, bodies: Sequence[BodyRef]) -> list[CacheHit | Failed]:
         """Store the Signatures of bodies of one file in the cache, and return the cache entry or failure of each.
 
         Signatures are not returned, because sending them from a worker would take time. If the only body cannot be
         used, a MeshError is raised; if the machine is at fault, a MachineError.
         """
-        if len(bodies) == 1:
-            return [self._own_hit(bodies[0])]
-        if bodies[0] in self.meshes:
-            return [attempt(partial(self._own_hit, body)) for body in bodies]
         content = self.content(bodies[0])
-        found = {body: self.find(body, content) for body in bodies}
-        outcomes = {body: outcome for body, outcome in found.items() if outcome is not None}
-        missing = [body for body in bodies if body not in outcomes]
+        if len(bodies) == 1:
+            return [self.hit(bodies[0], content)]
+        outcomes: dict[BodyRef, CacheHit | Failed] = {}
+        missing = []
+        for body in bodies:
+            found = self.find(body, content)
+            if found is None:
+                missing.append(body)
+            else:
+                outcomes[body] = found
         try:
             for body, raw in self._surfaces(missing, content):
                 try:
                     mesh = self._body(raw, body)
                 except MeshError as error:
-                    self.remember(body, content, error)
-                    outcomes[body] = Failed.of(error)
+                    outcomes[body] = self.remember(body, content, error)
                 else:
-                    outcomes[body] = attempt(partial(self.hit, body, content, mesh))
+                    outcomes[body] = attempt(partial(self._new_hit, body, content, mesh))
         except MeshError as error:  # in the file, and thus in all bodies that were not read before
             for body in missing:
                 if body not in outcomes:
-                    self.remember(body, content, error)
-                    outcomes[body] = Failed.of(error)
+                    outcomes[body] = self.remember(body, content, error)
         for body in bodies:
-            if body not in outcomes:  # it is not in the file, which `hit` reports
-                outcomes[body] = attempt(partial(self.hit, body, content))
+            if body not in outcomes:  # it is not in the file, which reading it alone reports
+                outcomes[body] = attempt(partial(self._new_hit, body, content))
         return [outcomes[body] for body in bodies]
 
-    def _own_hit(self, body: BodyRef) -> CacheHit:
-        return self.hit(body, self.content(body))
+    def hit(self, body: BodyRef, content: Content) -> CacheHit:
+        """Return the cache entry of a body, computed if missing; raise a MeshError if the body cannot be used."""
+        found = self.find(body, content)
+        if isinstance(found, Failed):
+            raise MeshError(found.reason)
+        return self._new_hit(body, content) if found is None else found
+
+    def _new_hit(self, body: BodyRef, content: Content, mesh: Mesh | None = None) -> CacheHit:
+        signature = self._compute(body, content, mesh)
+        return replace(
+            self._keys(body, content),
+            notes=tuple(signature.notes),
+            unit=signature.unit,
+            measures=signature.measures,
+        )
 
     def _keys(self, body: BodyRef, content: Content) -> CacheHit:
         """Return the cache entry that a body has, or would have, without what its header tells."""
@@ -234,10 +233,10 @@ class SignaturePipeline:
             for name, source in self.attributes.items()
         }
         if self.pre_transform is None:
-            return CacheHit(key, attributes, content.files)
+            return CacheHit(key, attributes)
         tag = self.pre_transform.cache_tag
         transformed = derived_key("transformed", key, tag, sorted(attributes.items()))
-        return CacheHit(transformed, {}, content.files)
+        return CacheHit(transformed)
 
     def _compute(self, body: BodyRef, content: Content, mesh: Mesh | None = None) -> Signature:
         """Compute the Signature of a body, with attributes and transform, into the cache."""
@@ -319,12 +318,13 @@ class SignaturePipeline:
         content: Content,
         error: MeshError,
         config: SignatureConfig | None = None,
-    ) -> None:
+    ) -> Failed:
         """Keep why a body cannot be used, with a configuration or any, unless the machine may be at fault."""
-        if body in self.meshes or isinstance(error.__cause__, OSError):
-            return
-        record = Record({}, {"reason": str(error), "summary": error.summary})
-        self.put("failure", self._failure_key(body, content, config), record)
+        failed = Failed.of(error)
+        if body not in self.meshes and not isinstance(error.__cause__, OSError):
+            record = Record({}, {"reason": failed.reason, "summary": failed.summary})
+            self.put("failure", self._failure_key(body, content, config), record)
+        return failed
 
 
 def _values_of(record: Record) -> dict[SampleKind, Singles]:

@@ -1,5 +1,6 @@
 """Batch sampler that reduces padding."""
 
+import math
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -26,7 +27,6 @@ class BucketBatchSampler(Sampler[list[int]]):
     Args:
         sizes: (N,) sizes of the shapes, see `SignatureDataset.sizes`.
         batch_size: number of shapes in a batch; one batch may be smaller.
-        drop_last: leave out the smaller batch.
         generator: generator of the random order; PyTorch's global generator if None.
     """
 
@@ -35,18 +35,15 @@ class BucketBatchSampler(Sampler[list[int]]):
         sizes: Sequence[int] | Tensor,
         batch_size: int,
         *,
-        drop_last: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         check_at_least(1, batch_size=batch_size)
         self.sizes = torch.as_tensor(sizes)
         self.batch_size = batch_size
-        self.drop_last = drop_last
         self.generator = generator
 
     def __len__(self) -> int:
-        n_full, n_left = divmod(len(self.sizes), self.batch_size)
-        return n_full + (n_left > 0 and not self.drop_last)
+        return math.ceil(len(self.sizes) / self.batch_size)
 
     def __iter__(self) -> Iterator[list[int]]:
         order = torch.randperm(len(self.sizes), generator=self.generator)
@@ -54,8 +51,6 @@ class BucketBatchSampler(Sampler[list[int]]):
         for bucket in order.split(_BATCHES_PER_BUCKET * self.batch_size):
             # A stable sort keeps shapes of equal size in their random order
             by_size = bucket[torch.sort(self.sizes[bucket], stable=True).indices]
-            batches += [batch.tolist() for batch in by_size.split(self.batch_size)]
-        min_size = self.batch_size if self.drop_last else 1
-        batches = [batch for batch in batches if len(batch) >= min_size]
+            batches += [batch.tolist() for batch in by_size.split(self.batch_size) if len(batch)]
         for i in torch.randperm(len(batches), generator=self.generator).tolist():
             yield batches[i]

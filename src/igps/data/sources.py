@@ -10,6 +10,7 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -32,43 +33,39 @@ ClassRule = Literal["folder", "body", "file"]
 class Bodies:
     """Bodies in files, with names, classes and further columns."""
 
-    paths: tuple[Path, ...]  # file of each body
+    refs: tuple[BodyRef, ...]  # file of each body, and its name in the file
     # Unique: path of the file relative to the searched folder, and `#part` if it has a part
     names: tuple[str, ...]
     labels: tuple[str, ...] | None = None  # class of each body; None if there are no classes
-    # Name of each body in its file; None if the file is one body
-    parts: tuple[str | None, ...] = ()
     # Further columns of `labels.csv` by name, with one value for each body; None if a value is missing (empty, NA, ...)
     columns: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict, hash=False)
-    # Number of each label in its file, which names do not change; None for other bodies
-    label_numbers: tuple[str | None, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.parts:
-            object.__setattr__(self, "parts", (None,) * len(self.paths))
-        if not self.label_numbers:
-            object.__setattr__(self, "label_numbers", (None,) * len(self.paths))
-        fields = (
-            ("names", self.names),
-            ("labels", self.labels),
-            ("parts", self.parts),
-            ("label_numbers", self.label_numbers),
-            *self.columns.items(),
-        )
-        for name, values in fields:
-            if values is not None and len(values) != len(self.paths):
+        fields = {"names": self.names, "labels": self.labels, **self.columns}
+        for name, values in fields.items():
+            if values is not None and len(values) != len(self):
                 raise ValueError(
-                    f"{name}: expected one for each of {len(self.paths)} files, got {len(values)}."
+                    f"{name}: expected one for each of {len(self)} bodies, got {len(values)}."
                 )
 
+    @cached_property
+    def paths(self) -> tuple[Path, ...]:
+        """File of each body."""
+        return tuple(ref.path for ref in self.refs)
+
+    @cached_property
+    def parts(self) -> tuple[str | None, ...]:
+        """Name of each body in its file; None if the file is one body."""
+        return tuple(ref.part for ref in self.refs)
+
     def __len__(self) -> int:
-        return len(self.paths)
+        return len(self.refs)
 
     def __getitem__(self, index: int) -> BodyRef:
-        return BodyRef(self.paths[index], self.parts[index], self.label_numbers[index])
+        return self.refs[index]
 
     def __iter__(self) -> Iterator[BodyRef]:
-        return map(BodyRef, self.paths, self.parts, self.label_numbers)
+        return iter(self.refs)
 
     def number(self, name: str) -> int:
         """Return the index of a body by its name; raise a KeyError if there is no such body."""
@@ -79,12 +76,10 @@ class Bodies:
     def subset(self, indices: Sequence[int]) -> Bodies:
         """Return the bodies with these indices, in this order."""
         return Bodies(
-            tuple(self.paths[i] for i in indices),
+            tuple(self.refs[i] for i in indices),
             tuple(self.names[i] for i in indices),
             None if self.labels is None else tuple(self.labels[i] for i in indices),
-            tuple(self.parts[i] for i in indices),
             {name: tuple(values[i] for i in indices) for name, values in self.columns.items()},
-            tuple(self.label_numbers[i] for i in indices),
         )
 
     def column(self, name: str) -> tuple[str, ...]:
@@ -201,21 +196,22 @@ def _from_folder(root: Path, listing: Listing, attributes: Iterable[AttributeSou
     }
     at_root = [path for path in files if path.parent == root and path not in excluded]
     nested = [path for path in files if path.parent != root and path not in excluded]
+    files_of_bodies = nested or at_root
     if at_root and nested:
         ignored = f"{len(at_root)} files beside the folders of classes are ignored, such as {at_root[0].name}"
         logger.warning(
             "%s: %s. Put them into a folder, or list all in a %s.", root, ignored, LABELS_FILE
         )
-    names = [(path, path.relative_to(root)) for path in nested or at_root]
-    if not names:
+    if not files_of_bodies:
         raise FileNotFoundError(
             f"{root}: no body found. Expected a folder per class, or files with a {LABELS_FILE} (file,label), "
             f"in one of the formats {', '.join(searched_suffixes())}."
         )
-    rows = [
-        (path, name.as_posix(), name.parts[0] if nested else None, None) for path, name in names
-    ]
-    return _bodies_in_files(rows, listing)
+    rows = []
+    for path in files_of_bodies:
+        name = path.relative_to(root)
+        rows.append(_Row(path, name.as_posix(), name.parts[0] if nested else None))
+    return _bodies_of_rows(rows, listing)
 
 
 def bodies_of_files(
@@ -234,11 +230,11 @@ def bodies_of_files(
         )
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
-    classes: Sequence[str | None] = [None] * len(files) if labels is None else list(labels)
-    rows = [
-        (file, str(file), label, part) for (file, part), label in zip(files, classes, strict=True)
-    ]
-    return _bodies_in_files(rows, Listing(options or LoadOptions(), cache_dir))
+    rows = []
+    for i, (file, part) in enumerate(files):
+        label = None if labels is None else labels[i]
+        rows.append(_Row(file, str(file), label, part))
+    return _bodies_of_rows(rows, Listing(options or LoadOptions(), cache_dir))
 
 
 def bodies_of(
@@ -290,6 +286,17 @@ def file_name_of(name: str, part: str | None) -> str:
     return name if part is None else name.removesuffix(f"#{part}")
 
 
+@dataclass(frozen=True)
+class _Row:
+    """A file of a collection, with one of its bodies or all of them."""
+
+    path: Path
+    name: str  # of the file
+    label: str | None = None
+    part: str | None = None  # the chosen body; None for all bodies of the file
+    values: Mapping[str, str | None] = field(default_factory=dict)  # of further columns
+
+
 def _from_labels_file(root: Path, listing: Listing) -> Bodies:
     file = root / LABELS_FILE
     text = table_text(file)
@@ -299,51 +306,51 @@ def _from_labels_file(root: Path, listing: Listing) -> Bodies:
         )
         try:
             reader.fieldnames = [_column_name(name) for name in reader.fieldnames or ()]
-            rows = [
-                (reader.line_num, {name: "".join(value).strip() for name, value in row.items()})
-                for row in reader
-            ]
+            lines = [(reader.line_num, line) for line in reader]
         except csv.Error as error:
             raise ValueError(
                 f"{file}: not readable as a table ({error}). Save it as CSV in UTF-8."
             ) from error
         header = [name for name in reader.fieldnames if name]
-        further_columns = [name for name in header if name not in ("file", "body", "label")]
-        if "file" not in header or not ("label" in header or further_columns):
-            expected = "expected the columns file,label in the first line, separated by commas"
-            raise ValueError(f"{file}: {expected}, got {reader.fieldnames}.")
-        if len(set(header)) < len(header):
-            raise ValueError(
-                f"{file}: a column is named twice in {header}. Give each column a name of its own."
-            )
-    if long := [line for line, row in rows if row.get(None)]:  # the key of values without a column
+    further_columns = [name for name in header if name not in ("file", "body", "label")]
+    if "file" not in header or not ("label" in header or further_columns):
+        expected = "expected the columns file,label in the first line, separated by commas"
+        raise ValueError(f"{file}: {expected}, got {header}.")
+    if len(set(header)) < len(header):
         raise ValueError(
-            f"{file}: line {long[0]} has more values than columns. Put a value with a comma in quotes."
+            f"{file}: a column is named twice in {header}. Give each column a name of its own."
         )
-    required = {"file", "label"} & {*header}
-    invalid = [
-        line for line, row in rows if any("\0" in (row.get(name) or "\0") for name in required)
-    ]
-    if not rows or invalid:
-        cause = f"line {invalid[0]} lacks the name of a file, or a label" if invalid else "no rows"
-        raise ValueError(f"{file}: {cause}. Each line names a file and its class.")
-    missing = ("", "na", "n/a", "nan")  # as R and pandas write it
-    columns = {
-        name: [None if row[name].lower() in missing else row[name] for _, row in rows]
-        for name in further_columns
-    }
-    files = [
-        (root / row["file"], row["file"], row.get("label"), row.get("body") or None)
-        for _, row in rows
-    ]
-    bodies = _bodies_in_files(files, listing, columns)
-    # ./1.off is 1.off
-    counts = Counter(keys := [(os.path.abspath(body.path), body.part) for body in bodies])
-    if duplicates := sorted(
-        name for name, key in zip(bodies.names, keys, strict=True) if counts[key] > 1
-    ):
-        raise ValueError(f"{file}: {duplicates[0]} is listed twice. List each body once.")
+    rows = []
+    for number, line in lines:
+        if None in line:  # the key of values without a column
+            raise ValueError(
+                f"{file}: line {number} has more values than columns. Put a value with a comma in quotes."
+            )
+        values = {name: line[name].strip() for name in header}
+        required = [values[name] for name in ("file", "label") if name in header]
+        is_whole = all(required) and "\0" not in "".join(required)
+        if not is_whole:
+            cause = f"line {number} lacks the name of a file, or a label"
+            raise ValueError(f"{file}: {cause}. Each line names a file and its class.")
+        further = {name: _known_value(values[name]) for name in further_columns}
+        name = values["file"]
+        part = values.get("body") or None
+        rows.append(_Row(root / name, name, values.get("label"), part, further))
+    if not rows:
+        raise ValueError(f"{file}: no rows. Each line names a file and its class.")
+    bodies = _bodies_of_rows(rows, listing)
+    listed = set()
+    for name, ref in zip(bodies.names, bodies, strict=True):
+        place = (os.path.abspath(ref.path), ref.part)  # ./1.off is 1.off
+        if place in listed:
+            raise ValueError(f"{file}: {name} is listed twice. List each body once.")
+        listed.add(place)
     return bodies
+
+
+def _known_value(value: str) -> str | None:
+    """Return the value of a table, None if it is missing, as R and pandas write it."""
+    return None if value.lower() in ("", "na", "n/a", "nan") else value
 
 
 def _column_name(name: str) -> str:
@@ -352,29 +359,29 @@ def _column_name(name: str) -> str:
     return name.lower() if name.lower() in ("file", "body", "label") else name
 
 
-def _bodies_in_files(
-    rows: Sequence[tuple[Path, str, str | None, str | None]],
-    listing: Listing,
-    columns: Mapping[str, Sequence[str | None]] | None = None,
-) -> Bodies:
-    """Return the bodies of files, given by path, name, label and part; without a part, all bodies of the file."""
-    listed = listing.of(path for path, _, _, part in rows if part is None or has_numbers(path))
+def _bodies_of_rows(rows: Sequence[_Row], listing: Listing) -> Bodies:
+    """Return the bodies of all files in their order."""
+    listed = listing.of(row.path for row in rows if row.part is None or has_numbers(row.path))
     _number_lone_labels(listed)
-    entries: list[tuple[int, Path, str, str | None, str | None, str | None]] = []
-    for i, (path, name, label, chosen) in enumerate(rows):
-        refs = listed.get(path, [])
-        if chosen is not None:
-            numbers = {key: ref.number for ref in refs for key in (ref.number, ref.part)}
-            refs = [BodyRef(path, chosen, numbers.get(chosen))]
-        for ref in refs:
-            full_name = name if ref.part is None else f"{name}#{ref.part}"
-            entries.append((i, path, full_name, label, ref.part, ref.number))
-    indices, paths, names, labels, parts, numbers_of = zip(*entries, strict=True)
-    body_columns = {
-        name: tuple(values[i] for i in indices) for name, values in (columns or {}).items()
-    }
-    known_labels = None if None in labels else labels
-    return Bodies(paths, names, known_labels, parts, body_columns, numbers_of)
+    refs = []
+    names = []
+    row_of_body = []
+    for row in rows:
+        found = listed.get(row.path, [])
+        if row.part is not None:
+            numbers = {name: ref.number for ref in found for name in (ref.number, ref.part)}
+            found = [BodyRef(row.path, row.part, numbers.get(row.part))]
+        for ref in found:
+            refs.append(ref)
+            names.append(row.name if ref.part is None else f"{row.name}#{ref.part}")
+            row_of_body.append(row)
+    labels = tuple(row.label for row in row_of_body if row.label is not None)
+    return Bodies(
+        tuple(refs),
+        tuple(names),
+        labels if len(labels) == len(refs) else None,
+        {name: tuple(row.values[name] for row in row_of_body) for name in rows[0].values},
+    )
 
 
 def _number_lone_labels(listed: dict[Path, list[BodyRef]]) -> None:
@@ -407,23 +414,23 @@ def _number_lone_labels(listed: dict[Path, list[BodyRef]]) -> None:
 def _files_in(folder: Path) -> list[Path]:
     """Find files that may be bodies, except for hidden ones. Broken links are included, and fail when they are read."""
     message = "%s: this folder is left out (%s). Ask for the right to read it."
+
+    def warn(error: OSError) -> None:
+        logger.warning(message, error.filename, error.strerror)
+
     files = []
-    for parent, folders, names in os.walk(
-        folder, onerror=lambda e: logger.warning(message, e.filename, e.strerror)
-    ):
+    for parent, folders, names in os.walk(folder, onerror=warn):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        for path in (
-            Path(parent, name)
-            for name in names
-            if not name.startswith(".") and is_searched(Path(parent, name))
-        ):
+        for name in names:
+            path = Path(parent, name)
+            if name.startswith(".") or not is_searched(path):
+                continue
+            is_pipe = path.exists() and not path.is_file()  # whose reading might never end
             if not _is_utf8(path):
                 remedy = "Rename it, or set PYTHONUTF8=1"
                 fault = f"{os.fsencode(path)!r}: left out, its name is not UTF-8"
                 logger.warning("%s. %s.", fault, remedy)
-            elif os.path.isfile(path) or not os.path.exists(
-                path
-            ):  # not a pipe, whose reading might never end
+            elif not is_pipe:
                 files.append(path)
     return files
 

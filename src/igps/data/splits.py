@@ -1,7 +1,7 @@
 """Seeded splits of a labelled collection into training, validation and test."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -30,28 +30,19 @@ class Parts:
         n_train: number of shapes of each class ("seen") or of classes ("unseen") in training and validation together;
             a share if below 1.
         n_validation: how many of these are for validation, 0 or at least 2 of a class; a share if below 1.
-        n_test: number of test classes ("unseen" only); all other classes if None.
         seed: of the random numbers.
     """
 
     protocol: SplitProtocol = "seen"
     n_train: int | float = 10
     n_validation: int | float = 2
-    n_test: int | None = None
     seed: int = 0
 
     def split(self, labels: Tensor) -> Split:
         """Split shapes with labels (N,); raise a ValueError if validation shapes cannot retrieve each other."""
         check_one_of(get_args(SplitProtocol), protocol=self.protocol)
-        options: dict[str, Any] = {"n_validation": self.n_validation, "seed": self.seed}
-        if self.protocol == "unseen":
-            split = split_unseen(labels, self.n_train, n_test=self.n_test, **options)
-        elif self.n_test is not None:
-            raise ValueError(
-                "n_test: expected None with protocol 'seen', which tests all shapes not trained on."
-            )
-        else:
-            split = split_seen(labels, self.n_train, **options)
+        divide = split_seen if self.protocol == "seen" else split_unseen
+        split = divide(labels, self.n_train, n_validation=self.n_validation, seed=self.seed)
         validation = labels[list(split.validation)]
         if len(validation) and len(validation.unique()) == len(validation):
             raise ValueError(
@@ -98,23 +89,16 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
 
 
 def split_unseen(
-    labels: Tensor,
-    n_train: float,
-    *,
-    n_validation: float = 0,
-    n_test: int | None = None,
-    seed: int = 0,
+    labels: Tensor, n_train: float, *, n_validation: float = 0, seed: int = 0
 ) -> Split:
     """Split the classes, so that no class is in two parts.
 
-    With the same seed and `n_test`, the test classes do not depend on `n_train`, and a larger `n_train` adds training
-    classes without removing any.
+    With the same seed, a larger `n_train` adds training classes without removing any.
 
     Args:
         labels: (N,) integer classes.
         n_train: number of classes in training and validation together; below 1 a share, which leaves at least 1.
         n_validation: how many of these are for validation; below 1 a share, which leaves at least 1.
-        n_test: number of test classes; all other classes if None.
 
     Raises:
         ValueError: there are too few classes, or none are left for training.
@@ -123,18 +107,18 @@ def split_unseen(
     _check(n_validation, n_train)
     n_fit = _count(n_train, len(classes), 1)
     n_held_out = _count(n_validation, n_fit, 1)
-    n_test = len(classes) - n_fit if n_test is None else n_test
-    if n_test < 1 or n_fit + n_test > len(classes):
-        raise ValueError(
-            f"n_train, n_test: expected at most {len(classes)} classes together, got {n_train}, {n_test}."
-        )
+    if n_fit >= len(classes):
+        raise ValueError(f"n_train: expected fewer than the {len(classes)} classes, got {n_train}.")
     shuffled = classes[torch.randperm(len(classes), generator=torch.Generator().manual_seed(seed))]
 
     def members(chosen: Tensor) -> tuple[int, ...]:
         return tuple(torch.nonzero(torch.isin(labels, chosen)).flatten().tolist())
 
-    test = shuffled[len(shuffled) - n_test :]
-    return Split(members(shuffled[n_held_out:n_fit]), members(shuffled[:n_held_out]), members(test))
+    return Split(
+        members(shuffled[n_held_out:n_fit]),
+        members(shuffled[:n_held_out]),
+        members(shuffled[n_fit:]),
+    )
 
 
 def _count(amount: float, n: int, min_count: int, min_left: int = 1) -> int:

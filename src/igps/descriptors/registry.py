@@ -2,7 +2,7 @@
 
 import importlib
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, get_args
@@ -113,19 +113,6 @@ def descriptor(
         with_side = with_side or base.twists is not None
         base = base.descriptor
     return SizeAndSide(base, size=with_size, side=with_side, scale=scale).eval()
-
-
-def attributes_suffix(attributes: Iterable[str]) -> str:
-    """Return the suffix of a name that adds attributes NAME or NAME=WEIGHT to a descriptor."""
-    suffix = ""
-    for attribute in attributes:
-        if _ATTRIBUTE.fullmatch(f"+{attribute}") is None:
-            raise ValueError(
-                "with: expected NAME or NAME=WEIGHT with a weight above 0, such as ct=0.5, "
-                f"got {attribute!r}."
-            )
-        suffix += f"+{attribute}"
-    return suffix
 
 
 def is_file(which: str | Path) -> bool:

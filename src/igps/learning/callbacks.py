@@ -2,7 +2,6 @@
 
 import csv
 from pathlib import Path
-from statistics import mean
 from typing import Any
 
 import torch
@@ -55,7 +54,6 @@ class TrainingCurve(Callback):
 
     def __init__(self) -> None:
         self.rows: list[dict[str, float]] = []
-        self._losses: list[float] = []
         self._scores: dict[str, float] = {}
 
     def state_dict(self) -> dict[str, Any]:
@@ -66,17 +64,6 @@ class TrainingCurve(Callback):
         """Restore the rows of a checkpoint."""
         self.rows = list(state_dict["rows"])
 
-    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Discard the values of an interrupted epoch."""
-        self._losses = []
-        self._scores = {}
-
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        """Collect the loss of a step."""
-        self._losses.append(float(outputs["loss"]))
-
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Collect the validation scores."""
         metrics = trainer.callback_metrics.items()
@@ -84,9 +71,9 @@ class TrainingCurve(Callback):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Add the row of the epoch, and write the file."""
-        self.rows.append(
-            {"epoch": trainer.current_epoch, "train_loss": mean(self._losses), **self._scores}
-        )
+        loss = float(trainer.callback_metrics["train_loss"])  # the mean of the epoch
+        self.rows.append({"epoch": trainer.current_epoch, "train_loss": loss, **self._scores})
+        self._scores = {}
         if trainer.is_global_zero:
             names = {name: None for row in self.rows for name in row}
             with (Path(trainer.default_root_dir) / "curve.csv").open("w", newline="") as file:

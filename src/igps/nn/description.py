@@ -240,7 +240,6 @@ class _DescriptionStore:
         self._tag = cache_tag
         self._keys = dataset.cached_keys()
         self._cache = dataset.pipeline.cache("description")
-        self._cache.remove_abandoned()
         self._is_writable = True
 
     def read(self) -> dict[int, Singles]:

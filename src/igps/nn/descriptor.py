@@ -190,8 +190,6 @@ def _check_finite(module: nn.Module) -> None:
 class BodyDescriptor(Descriptor):
     """A descriptor that describes one body at a time, in NumPy, without gradients.
 
-    The constructors of the library's own body descriptors raise a ValueError for a parameter out of range.
-
     Example:
         >>> import trimesh
         >>> from igps import SignatureConfig, collate, compute_signature

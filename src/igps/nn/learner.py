@@ -195,7 +195,15 @@ class RetrievalLearner(LightningModule):
         labels = _known_labels(batch)
         mined = () if self.miner is None else (self.miner(embeddings, labels),)
         loss: Tensor = self.loss(embeddings, labels, *mined)
-        self.log("train_loss", loss, batch_size=len(batch), prog_bar=True)
+        self.log(
+            "train_loss",
+            loss,
+            prog_bar=True,
+            on_step=True,
+            on_epoch=True,
+            sync_dist=True,
+            batch_size=len(batch),
+        )
         return loss
 
     @one_thread()

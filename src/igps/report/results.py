@@ -14,6 +14,7 @@ from torch import Tensor
 from igps._arrays import Integers
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies, file_name_of
+from igps.mesh.loading import BodyRef
 from igps.mesh.options import LoadOptions
 from igps.retrieval import rank
 from igps.signature.signature import SignatureConfig
@@ -144,17 +145,16 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
         summary: dict[str, Any] = json.loads(path.read_text())
         if summary["format"] != _FORMAT:
             raise ValueError(f"its format is {summary['format']!r}")
-        names = tuple(str(mesh["file"]) for mesh in summary["meshes"])
-        parts = tuple(mesh.get("part") for mesh in summary["meshes"])
-        numbers = tuple(mesh.get("number") for mesh in summary["meshes"])
-        if meshes is None:
-            paths = tuple(Path(mesh["path"]) for mesh in summary["meshes"])
-        else:
-            paths = tuple(
-                meshes / file_name_of(name, part) for name, part in zip(names, parts, strict=True)
-            )
+        refs = []
+        names = []
+        for mesh in summary["meshes"]:
+            name = str(mesh["file"])
+            part = mesh.get("part")
+            path = Path(mesh["path"]) if meshes is None else meshes / file_name_of(name, part)
+            refs.append(BodyRef(path, part, mesh.get("number")))
+            names.append(name)
         columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
-        bodies = Bodies(paths, names, None, parts, columns, numbers)
+        bodies = Bodies(tuple(refs), tuple(names), None, columns)
         reading = LoadOptions(**summary["reading"])
         return SignatureDataset(
             bodies, SignatureConfig(**summary["signature"]), summary["cache_dir"], reading=reading

@@ -3,6 +3,7 @@
 import json
 import operator
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from igps._parameters import check_at_least
 from igps._progress import Progress
 from igps.shapes.meshing import defect, mesh, roughen
 from igps.shapes.skeleton import pose
-from igps.shapes.templates import TEMPLATES
+from igps.shapes.templates import TEMPLATES, Template
 
 _VERSION = 1  # raise it whenever the same arguments give other meshes
 _MAX_ATTEMPTS = 20
@@ -46,23 +47,30 @@ class ArticulatedShapes:
         (['biped', 'quadruped', 'octopus'], 6)
 
     Args:
-        n_classes: number of classes, at most twelve.
+        n_classes: number of classes, the first of `templates`.
         n_per_class: number of shapes of each class.
         seed: seed of all random draws, not negative.
         n_vertices: number of vertices of a shape, within 40 percent.
+        templates: what makes the skeleton of each class, by its name; eight animals and things by default.
 
     Raises:
         ValueError: an argument is out of range, or (on access) a shape cannot be made at this resolution.
     """
 
     def __init__(
-        self, n_classes: int = 8, n_per_class: int = 10, seed: int = 0, n_vertices: int = 3000
+        self,
+        n_classes: int = 8,
+        n_per_class: int = 10,
+        seed: int = 0,
+        n_vertices: int = 3000,
+        templates: Mapping[str, Template] = TEMPLATES,
     ) -> None:
         check_at_least(1, n_classes=n_classes, n_per_class=n_per_class)
         check_at_least(0, seed=seed)
         check_at_least(500, n_vertices=n_vertices)
-        if n_classes > len(TEMPLATES):
-            raise ValueError(f"n_classes must be at most {len(TEMPLATES)}, got {n_classes}")
+        if n_classes > len(templates):
+            raise ValueError(f"n_classes must be at most {len(templates)}, got {n_classes}")
+        self.templates = templates
         self.n_classes = n_classes
         self.n_per_class = n_per_class
         self.seed = seed
@@ -78,7 +86,7 @@ class ArticulatedShapes:
     @property
     def class_names(self) -> list[str]:
         """The unique names of the classes, in order."""
-        return list(TEMPLATES)[: self.n_classes]
+        return list(self.templates)[: self.n_classes]
 
     @property
     def labels(self) -> list[str]:
@@ -103,8 +111,8 @@ class ArticulatedShapes:
         return self._generate(class_index, number)
 
     def _generate(self, class_index: int, number: int) -> GeneratedShape:
-        label = list(TEMPLATES)[class_index]
-        skeleton = TEMPLATES[label]()
+        label = list(self.templates)[class_index]
+        skeleton = self.templates[label]()
         name = f"{label}/{number:02d}"
         motion = np.random.default_rng([self.seed, _MOTION, class_index, number])
         rotation = np.asarray(Rotation.from_quat(motion.normal(size=4)).as_matrix())
@@ -128,10 +136,11 @@ class ArticulatedShapes:
         )
 
     def write(self, root: str | os.PathLike[str], progress: bool = False) -> None:
-        """Write each shape to ``root/<class>/<number>.off``, unless a complete file exists.
+        """Write each shape to ``root/<class>/<number>.off``, unless the file exists.
 
-        Files are written atomically: the same call resumes an interrupted one, and several processes may write at once.
-        ``root/shapes.json`` records the settings of the generator; classes and shapes may be added later.
+        Files are written atomically, so that each is whole: the same call resumes an interrupted one, and several
+        processes may write at once. ``root/shapes.json`` records the settings of the generator; classes and shapes may
+        be added later.
 
         Raises:
             ValueError: ``root`` holds shapes of another seed, resolution or version.
@@ -147,7 +156,7 @@ class ArticulatedShapes:
             Progress(self.names, desc="shapes", unit="shape", disable=not progress)
         ):
             path = folder / f"{name}.off"
-            if not is_whole_off(path):
+            if not path.exists():
                 shape = self[index]
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with atomic_write(path) as file:
@@ -178,12 +187,3 @@ def off_text(vertices: Floats, faces: Integers) -> str:
     lines += [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in vertices.tolist()]
     lines += [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
     return "\n".join(lines) + "\n"
-
-
-def is_whole_off(path: Path) -> bool:
-    """Return whether a file is OFF with as many lines as its header declares."""
-    text = path.read_bytes() if path.is_file() else b""
-    header = text[:64].split()
-    if len(header) < 3 or header[0] != b"OFF":
-        return False
-    return text.endswith(b"\n") and text.count(b"\n") == 2 + int(header[1]) + int(header[2])

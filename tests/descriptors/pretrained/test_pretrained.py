@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 from training.pretrain import save_pretrained
 from training.shapes import GradedShapes
+from training.shapes.templates import TEMPLATES
 
 import igps
 from igps import Mesh, collate
@@ -40,7 +41,8 @@ PART_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180, 91)
 def dataset(tmp_path_factory):
     """Shapes of a seed that the shipped head was not fitted to."""
     root = tmp_path_factory.mktemp("shapes")
-    ArticulatedShapes(n_classes=12, n_per_class=3, seed=7, n_vertices=800).write(root)
+    shapes = ArticulatedShapes(12, n_per_class=3, seed=7, n_vertices=800, templates=TEMPLATES)
+    shapes.write(root)
     needs = rich().requirements | pretrained_parts().requirements
     config = needs.apply_to(SignatureConfig(n_eigenpairs=90, n_surface_samples=1000))
     return SignatureDataset(root, config, root / "cache")

@@ -1,6 +1,5 @@
 """Canonical forms: embeddings of surfaces that undo bending, compared like rigid bodies (Elad and Kimmel 2003)."""
 
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -9,7 +8,6 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from igps._arrays import Floats, Integers, Singles
-from igps._parameters import check_at_least
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors.literature._geodesics import geodesic_samples
@@ -21,7 +19,6 @@ _TOLERANCE = 1e-4  # relative reduction of the stress by a step, below which the
 _MAX_STEPS = 300
 
 
-@dataclass(eq=False, repr=False)
 class CanonicalForm(BodyDescriptor):
     """Moments of the canonical form, whose Euclidean distances approximate the geodesic distances of the surface.
 
@@ -36,18 +33,9 @@ class CanonicalForm(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements(mesh=True)
 
-    max_order: int = 4  # largest order of the moments
-    n_samples: int = 200  # samples of the surface, by farthest-point sampling
-    max_vertices: int = 1000  # larger meshes are simplified first
-
-    def __post_init__(self) -> None:
-        super().__init__()
-        # Moments of lower order are the same for all bodies
-        check_at_least(2, max_order=self.max_order)
-        if not _DIMENSION < self.n_samples <= self.max_vertices:
-            raise ValueError(
-                f"n_samples: expected {_DIMENSION + 1} to max_vertices = {self.max_vertices}, got {self.n_samples}."
-            )
+    max_order = 4  # largest order of the moments
+    n_samples = 200  # samples of the surface, by farthest-point sampling
+    max_vertices = 1000  # larger meshes are simplified first
 
     def describe_body(self, body: Body) -> Singles:
         """(M,) moments in units of √area, in the order of `exponents`; raises the errors of `geodesic_samples`."""

@@ -1,20 +1,17 @@
 """The shape distribution D2: the histogram of the distances between surface points (Osada et al. 2002)."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from igps._arrays import Singles
-from igps._parameters import check_at_least, check_positive
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.nn.descriptor import BodyDescriptor
 
 
-@dataclass(eq=False, repr=False)
 class D2(BodyDescriptor):
     """Histogram of the distances between all pairs of the Signature's surface samples, in units of √area.
 
@@ -27,15 +24,8 @@ class D2(BodyDescriptor):
     invariant_to = ("motion", "scale")
     requirements = Requirements()
 
-    n_bins: int = 64  # bins of equal width
-    reach: float = (
-        2.0  # upper end of the last bin, in units of √area; larger distances go into this bin
-    )
-
-    def __post_init__(self) -> None:
-        super().__init__()
-        check_at_least(1, n_bins=self.n_bins)
-        check_positive(reach=self.reach)
+    n_bins = 64  # of equal width
+    reach = 2.0  # upper end of the last bin, in units of √area; larger distances go into this bin
 
     def describe_body(self, body: Body) -> Singles:
         """(n_bins,) histogram of sum 1; a ValueError if the Signature has fewer than two surface samples."""

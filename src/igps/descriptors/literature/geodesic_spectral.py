@@ -1,18 +1,14 @@
 """Eigenvalues of an affinity matrix of geodesic distances (Jain and Zhang 2007)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from igps._arrays import Floats, Singles
-from igps._parameters import check_at_least
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors.literature._geodesics import geodesic_samples
 from igps.nn.descriptor import BodyDescriptor
 
 
-@dataclass(eq=False, repr=False)
 class GeodesicSpectral(BodyDescriptor):
     """Square roots of the largest eigenvalues of the matrix exp(−d²/2σ²) of geodesic distances d, with σ their maximum.
 
@@ -25,18 +21,9 @@ class GeodesicSpectral(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements(mesh=True)
 
-    n_eigenvalues: int = 20  # largest first
-    n_samples: int = 200  # samples of the surface, by farthest-point sampling
-    max_vertices: int = 1000  # larger meshes are simplified first
-
-    def __post_init__(self) -> None:
-        super().__init__()
-        check_at_least(1, n_eigenvalues=self.n_eigenvalues)
-        if not max(self.n_eigenvalues, 2) <= self.n_samples <= self.max_vertices:
-            raise ValueError(
-                f"n_samples: expected {max(self.n_eigenvalues, 2)} to max_vertices = {self.max_vertices}, "
-                f"got {self.n_samples}."
-            )
+    n_eigenvalues = 20  # largest first
+    n_samples = 200  # samples of the surface, by farthest-point sampling
+    max_vertices = 1000  # larger meshes are simplified first
 
     def describe_body(self, body: Body) -> Singles:
         """(n_eigenvalues,) √|λₖ|, without unit; raises the errors of `geodesic_samples`."""

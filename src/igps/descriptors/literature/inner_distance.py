@@ -7,7 +7,6 @@ inner distance in the union of the cells. Where all cells between two samples ar
 `METRICATION` times as long as their Euclidean distance.
 """
 
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -16,7 +15,6 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
 from igps._arrays import Floats, Integers, Singles
-from igps._parameters import check_at_least, check_positive
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors.literature._linear_histogram import linear_histogram
@@ -28,7 +26,6 @@ METRICATION = 1.0495
 _GRID_TOLERANCE = 1e-3  # largest distance of a sample from a grid point, in cells
 
 
-@dataclass(eq=False, repr=False)
 class InnerDistance(BodyDescriptor):
     """Histogram of the inner distances between interior samples, in units of √area.
 
@@ -43,23 +40,16 @@ class InnerDistance(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements()
 
-    n_bins: int = 64  # distance bins, with a linear kernel
+    n_bins = 64  # distance bins, with a linear kernel
     # Upper end of the last bin, in units of √area; larger distances go into this bin
-    max_distance: float = 3.0
-    n_sources: int = 200  # samples from which paths start; all samples if there are fewer
-    seed: int = 0  # of the choice of the sources
-
-    def __post_init__(self) -> None:
-        super().__init__()
-        check_at_least(2, n_bins=self.n_bins)
-        check_at_least(1, n_sources=self.n_sources)
-        check_positive(max_distance=self.max_distance)
+    max_distance = 3.0
+    n_sources = 200  # samples from which paths start; all samples if there are fewer
 
     def describe_body(self, body: Body) -> Singles:
         """(n_bins,) histogram of sum 1; raises the errors of `inner_distances`."""
         points = body.interior.points
         n_sources = min(self.n_sources, len(points))
-        sources = np.random.default_rng(self.seed).permutation(len(points))[:n_sources]
+        sources = np.random.default_rng(0).permutation(len(points))[:n_sources]
         lengths = inner_distances(points, sources)
         lengths[np.arange(n_sources), sources] = np.nan  # a sample and itself are no pair
         ratio = lengths[~np.isnan(lengths)] / np.sqrt(body.area)

@@ -1,11 +1,8 @@
 """Pose-oblivious signature of local diameter and centricity (Gal, Shamir and Cohen-Or 2007)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from igps._arrays import Floats, Integers, Singles
-from igps._parameters import check_at_least, check_positive
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors.literature._geodesics import farthest_points
@@ -23,7 +20,6 @@ _RAY_OFFSET = 1e-6
 _POINTS_PER_EDGE = 1
 
 
-@dataclass(eq=False, repr=False)
 class LocalDiameterCentricity(BodyDescriptor):
     """Joint histogram of the local diameter and the centricity over the surface, both in units of √area.
 
@@ -36,33 +32,20 @@ class LocalDiameterCentricity(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements(mesh=True)
 
-    n_diameter_bins: int = 32  # with a linear kernel
-    n_centricity_bins: int = 32  # with a linear kernel
+    n_diameter_bins = 32  # with a linear kernel
+    n_centricity_bins = 32  # with a linear kernel
     # Upper end of the last bin, in units of √area; larger values go into this bin
-    max_diameter: float = 0.45
-    max_centricity: float = 2.0  # the same for the centricity
-    n_samples: int = 2000  # area-weighted random points of the surface
-    n_rays: int = 30  # per sample
-    opening_angle: float = 120.0  # of the cone about the inward normal, degrees
-    n_sources: int = 40  # points of the surface over which the geodesic distances are averaged
-    seed: int = 0  # of the samples
-
-    def __post_init__(self) -> None:
-        super().__init__()
-        check_at_least(
-            2, n_diameter_bins=self.n_diameter_bins, n_centricity_bins=self.n_centricity_bins
-        )
-        check_at_least(1, n_samples=self.n_samples, n_rays=self.n_rays, n_sources=self.n_sources)
-        check_positive(max_diameter=self.max_diameter, max_centricity=self.max_centricity)
-        if not 0 < self.opening_angle < 180:
-            raise ValueError(
-                f"opening_angle: expected between 0 and 180 degrees, got {self.opening_angle}."
-            )
+    max_diameter = 0.45
+    max_centricity = 2.0  # the same for the centricity
+    n_samples = 2000  # area-weighted random points of the surface
+    n_rays = 30  # per sample
+    opening_angle = 120.0  # of the cone about the inward normal, degrees
+    n_sources = 40  # points of the surface over which the geodesic distances are averaged
 
     def describe_body(self, body: Body) -> Singles:
         """(n_diameter_bins, n_centricity_bins) histogram of sum 1; a MeshError if no ray meets the far side."""
         mesh = in_canonical_order(body.mesh)
-        points = surface_points(mesh, self.n_samples, self.seed)
+        points = surface_points(mesh, self.n_samples, seed=0)
         diameter = local_diameters(
             mesh, points.face, points.weights, self.n_rays, self.opening_angle
         )

@@ -1,19 +1,15 @@
 """Shape-DNA: the first eigenvalues of the surface (Reuter, Wolter and Peinecke 2005)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from torch import Tensor
 
 from igps._arrays import Singles
-from igps._parameters import check_at_least
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 
 
-@dataclass(eq=False, repr=False)
 class ShapeDNA(BodyDescriptor):
     """The first non-zero eigenvalues of the Laplace–Beltrami operator, times the area of the surface.
 
@@ -25,12 +21,8 @@ class ShapeDNA(BodyDescriptor):
     source = "Reuter, Wolter and Peinecke 2005"
     invariant_to = ("motion", "scale", "pose")
 
-    n_eigenvalues: int = 12
-
-    def __post_init__(self) -> None:
-        super().__init__()
-        check_at_least(1, n_eigenvalues=self.n_eigenvalues)
-        self.requirements = Requirements(n_eigenpairs=self.n_eigenvalues)
+    n_eigenvalues = 12
+    requirements = Requirements(n_eigenpairs=n_eigenvalues)
 
     def describe_body(self, body: Body) -> Singles:
         """(n_eigenvalues,) normalised eigenvalues, ascending, without unit."""

@@ -12,7 +12,6 @@ bound holds exactly.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,18 +19,13 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from igps._arrays import Floats, Singles
-from igps._parameters import check_at_least
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 from igps.signature.signature import Signature
 
-# c² is largest at t = 1 and falls off steeply on both sides.
-TIMES = (0.25, 0.5, 1.0, 2.0, 4.0)
 
-
-@dataclass(eq=False, repr=False)
 class SpectralGromovWasserstein(BodyDescriptor):
     """The lower bound of the spectral Gromov-Wasserstein distance by pairs of points, see this module."""
 
@@ -39,19 +33,15 @@ class SpectralGromovWasserstein(BodyDescriptor):
     source = "Mémoli 2009"
     invariant_to = ("motion", "scale", "pose")
 
-    times: tuple[float, ...] = TIMES  # in units of A/8π
-    n_samples: int = 500  # at most, at equal steps along the order of the samples
-    n_quantiles: int = 200  # steps of the quantile functions
+    # In units of A/8π; c² is largest at t = 1 and falls off steeply on both sides
+    times = (0.25, 0.5, 1.0, 2.0, 4.0)
+    n_samples = 500  # at most, at equal steps along the order of the samples
+    n_quantiles = 200  # steps of the quantile functions
     # Of the kernels; at the shortest default time the hundredth weighs 10⁻⁶ of the first
-    n_eigenpairs: int = 100
-    seed: int = 0  # of the offset of the steps along the order of the samples
-
-    def __post_init__(self) -> None:
-        super().__init__()
-        self.description_shape = (len(self.times), -1)
-        _check(self.times, self.n_samples)
-        check_at_least(1, n_quantiles=self.n_quantiles, n_eigenpairs=self.n_eigenpairs)
-        self.requirements = Requirements(n_eigenpairs=self.n_eigenpairs)
+    n_eigenpairs = 100
+    requirements = Requirements(n_eigenpairs=n_eigenpairs)
+    seed = 0  # of the offset of the steps along the order of the samples
+    description_shape = (len(times), -1)
 
     def describe_body(self, body: Body) -> Singles:
         """(times, n_quantiles) quantile functions of the kernels times c²(t)."""
@@ -79,7 +69,6 @@ def heat_kernels(
 
     For the parameters and errors see `SpectralGromovWasserstein`; all eigenpairs are used if `n_eigenpairs` is None.
     """
-    _check(times, n_samples)
     eigenfunctions = body.surface.eigenfunctions[:, :n_eigenpairs]
     # Samples are in a canonical order in which similar samples are neighbours, so that equal steps reach all parts.
     n_chosen = min(n_samples, len(eigenfunctions))
@@ -111,9 +100,3 @@ def quantiles(values: ArrayLike, n_quantiles: int) -> Floats:
     integral = np.concatenate([[0.0], np.cumsum(ordered)]) / len(ordered)
     ends = np.linspace(0, 1, n_quantiles + 1)
     return n_quantiles * np.diff(np.interp(ends, np.linspace(0, 1, len(integral)), integral))
-
-
-def _check(times: Sequence[float], n_samples: int) -> None:
-    check_at_least(1, n_samples=n_samples)
-    if not times or not all(0 < time < np.inf for time in times):
-        raise ValueError(f"times: expected at least one positive number, got {tuple(times)}.")

@@ -9,15 +9,12 @@ and Kang 2002. For that distance, a cell is sampled at 3³ points. Parts thinner
 only add eigenvalues far above the first ones.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import LinearOperator, lobpcg, splu
 from torch import Tensor
 
 from igps._arrays import Booleans, Floats, Singles
-from igps._parameters import check_at_least
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.mesh.errors import MeshError
@@ -28,14 +25,12 @@ from igps.retrieval.distances import euclidean
 from igps.signature.voxels import grid_axes, inside_grid
 
 _MAX_RESOLUTION = 128  # cells along the longest side; 3³ points for each cell must fit into memory
-# Shift of the inverse iteration, in units of volume^(-2/3): below the spectrum, and far from singular.
-_SHIFT = -1.0
-# Relative accuracy of the eigenvalues' distances from the shift, far below the error of the grid.
-_TOLERANCE = 1e-8
-_N_RECHECKED = 3  # eigenvalues in each search for missed copies of multiple eigenvalues
+# Largest residual of a unit vector; the error of an eigenvalue is about its square
+_TOLERANCE = 1e-6
+_MAX_STEPS = 200
+_N_GUARDS = 5  # further vectors of the block, which converge last
 
 
-@dataclass(eq=False, repr=False)
 class VolumeShapeDNA(BodyDescriptor):
     """The first non-zero eigenvalues of the Laplacian in the body, times volume^(2/3).
 
@@ -47,12 +42,8 @@ class VolumeShapeDNA(BodyDescriptor):
     invariant_to = ("motion", "scale")
     requirements = Requirements(mesh=True)
 
-    n_eigenvalues: int = 12
-    n_voxels: int = 4000  # a cell has 1/`n_voxels` of the volume, but its side is at least 1/128 of the longest side
-
-    def __post_init__(self) -> None:
-        super().__init__()
-        check_at_least(1, n_eigenvalues=self.n_eigenvalues, n_voxels=self.n_voxels)
+    n_eigenvalues = 12
+    n_voxels = 4000  # a cell has 1/`n_voxels` of the volume, but its side is at least 1/128 of the longest side
 
     def describe_body(self, body: Body) -> Singles:
         """(n_eigenvalues,) normalised eigenvalues, ascending, without unit; raises the errors of `volume_spectrum`."""
@@ -72,8 +63,8 @@ def volume_spectrum(mesh: Mesh, n_eigenvalues: int, n_voxels: int) -> Floats:
     """
     inside, cell = _sampled_cells(mesh, n_voxels)
     stiffness = _stiffness(inside)
-    # ARPACK needs space for its basis, and the search for missed eigenvalues needs a complement of that size.
-    min_cells = 2 * (n_eigenvalues + _N_RECHECKED) + 1
+    # The search for a block of eigenvectors needs a space that is several times as large
+    min_cells = 5 * (n_eigenvalues + _N_GUARDS) + 1
     n_cells = stiffness.shape[0]
     if n_cells < min_cells:
         raise MeshError(
@@ -81,7 +72,7 @@ def volume_spectrum(mesh: Mesh, n_eigenvalues: int, n_voxels: int) -> Floats:
             "needed. Raise n_voxels, or lower n_eigenvalues."
         )
     scale = (abs(mesh.volume) / cell**3) ** (2 / 3)
-    return _smallest_eigenvalues(stiffness, n_eigenvalues, _SHIFT / scale) * scale
+    return _smallest_eigenvalues(stiffness, n_eigenvalues) * scale
 
 
 def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[Booleans, float]:
@@ -141,41 +132,17 @@ def _stiffness(inside: Booleans) -> sparse.csr_array:
     return sparse.diags_array(diagonal[is_cell]) - links - links.T
 
 
-def _smallest_eigenvalues(stiffness: sparse.csr_array, n_values: int, shift: float) -> Floats:
-    """Smallest eigenvalues of K u = λ u, ascending, by Lanczos iteration on (K − shift I)⁻¹."""
+def _smallest_eigenvalues(stiffness: sparse.csr_array, n_values: int) -> Floats:
+    """Smallest eigenvalues of K u = λ u, ascending (LOBPCG, Knyazev 2001, with K⁻¹ as preconditioner).
+
+    A block of vectors finds all copies of multiple eigenvalues.
+    """
     matrix = stiffness.tocsc()
-    n_cells = matrix.shape[0]
-    shifted = (matrix - shift * sparse.eye_array(n_cells)).tocsc()
     # The matrix is positive definite: factorize without pivoting, in an elimination order for symmetric matrices.
     factor = splu(
-        shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )
-    inverse = LinearOperator(matrix.shape, factor.solve, dtype=np.float64)
-    start = np.random.default_rng(0).standard_normal(n_cells)
-    values, vectors = eigsh(matrix, n_values, sigma=shift, OPinv=inverse, v0=start, tol=_TOLERANCE)
-    while True:
-        # An iteration from a single vector may find only one copy of a multiple eigenvalue. The missed copies lie in
-        # the orthogonal complement of the eigenvectors found so far.
-        def in_complement(vector: Floats, known: Floats = vectors) -> Floats:
-            return _project(factor.solve(_project(vector, known)), known)
-
-        complement = LinearOperator(matrix.shape, in_complement, dtype=np.float64)
-        start_beside = _project(start, vectors)
-        inverses, candidates = eigsh(
-            complement, _N_RECHECKED, which="LA", v0=start_beside, tol=_TOLERANCE
-        )
-        found = shift + 1 / inverses
-        largest = values.max()
-        is_missed = found < largest - _TOLERANCE * (largest - shift)
-        if not is_missed.any():
-            return np.sort(values)
-        values = np.concatenate([values, found[is_missed]])
-        vectors = np.hstack([vectors, candidates[:, is_missed]])
-        smallest = np.argsort(values)[:n_values]
-        values = values[smallest]
-        vectors = vectors[:, smallest]
-
-
-def _project(vector: Floats, basis: Floats) -> Floats:
-    """The part of a vector orthogonal to an orthonormal basis."""
-    return vector - basis @ (basis.T @ vector)
+    inverse = LinearOperator(matrix.shape, factor.solve, matmat=factor.solve, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal((matrix.shape[0], n_values + _N_GUARDS))
+    values, _ = lobpcg(matrix, start, M=inverse, tol=_TOLERANCE, maxiter=_MAX_STEPS, largest=False)
+    return np.sort(values)[:n_values]

@@ -154,10 +154,7 @@ class TwoLevelHead(Head):
 
     def compared_within_class(self, embeddings: Tensor) -> Tensor:
         """Return the columns of the body heads without the lengths behind them, which only scale the distance."""
-        heads = self._body_heads()
-        parts = self.within_class(embeddings).split([head.n_numbers for head in heads], dim=1)
-        compared = [part[:, : head.n_compared] for part, head in zip(parts, heads, strict=True)]
-        return torch.cat(compared, dim=1)
+        return torch.cat(self._compared(embeddings), dim=1) * self._root_share
 
     def shorten(self, embeddings: Tensor) -> Tensor:
         """Project embeddings (N, D) to (N, ≤ 256) of length 1, on the principal directions of the training shapes.
