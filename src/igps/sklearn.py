@@ -177,21 +177,15 @@ def _checked(shapes: Sequence[str | Path | Mesh]) -> list[Any]:
         raise TypeError(
             f"X: expected a list of paths of mesh files, or of meshes, got {str(shapes)!r} alone."
         )
-    items = list(shapes)
-    if isinstance(shapes, np.ndarray) or hasattr(
-        shapes, "to_numpy"
-    ):  # a list of a table would be its column names
-        table = np.asarray(shapes, dtype=object)
-        if table.shape[1:] not in ((), (1,)):
-            raise ValueError(
-                f"X: expected one column of paths or meshes, got an array of shape {table.shape}."
-            )
-        items = list(table.ravel())
-    types = {
-        Mesh if isinstance(item, Mesh) else Path if isinstance(item, str | Path) else type(item)
-        for item in items
-    }
-    if types not in ({Mesh}, {Path}):
-        names = sorted(kind.__name__ for kind in types) or ["nothing"]
+    table = np.asarray(shapes, dtype=object)  # a list of a table would be its column names
+    if table.shape[1:] not in ((), (1,)):
+        raise ValueError(
+            f"X: expected one column of paths or meshes, got an array of shape {table.shape}."
+        )
+    items = list(table.ravel())
+    are_paths = all(isinstance(item, str | Path) for item in items)
+    are_meshes = all(isinstance(item, Mesh) for item in items)
+    if not items or not (are_paths or are_meshes):
+        names = sorted({type(item).__name__ for item in items}) or ["nothing"]
         raise TypeError(f"X: expected paths of mesh files, or meshes, got {', '.join(names)}.")
     return items

@@ -635,10 +635,6 @@ def stem_and_height(body, points):
     return len(body.path.stem) + points[:, 2]
 
 
-def times(points, factor=2.0):
-    return factor * points[:, 0]
-
-
 def with_functions(folder, **functions):
     return SignatureDataset(folder / "shapes", CONFIG, folder / "cache", attributes=functions)
 
@@ -647,28 +643,21 @@ def test_a_function_of_body_and_points_gives_an_attribute(tmp_path):
     """Two copies of one file, which their names tell apart."""
     write_body(tmp_path / "shapes" / "a.off", 0.8, 0.9)
     shutil.copy(tmp_path / "shapes" / "a.off", tmp_path / "shapes" / "bbb.off")
-    dataset = with_functions(tmp_path, named=stem_and_height, x=times)
+    dataset = with_functions(tmp_path, named=stem_and_height)
     for item, n_letters in zip(dataset, (1, 3), strict=True):
         samples = item.signature.interior
         expected = n_letters + samples.points[:, 2]
         assert_allclose(samples.attributes["named"], expected, atol=1e-5)
-        doubled = 2 * samples.points[:, 0]
-        assert_allclose(samples.attributes["x"], doubled, atol=1e-5)
 
 
-@pytest.mark.parametrize("takes_body", [True, False])
-def test_values_of_a_function_are_cached_under_its_tag(tmp_path, takes_body):
+def test_values_of_a_function_are_cached_under_its_tag(tmp_path):
     write_body(tmp_path / "shapes" / "a.off", 0.8, 0.9)
     calls = []
 
-    def of_points(points):
+    def function(body, points):
         calls.append(len(points))
         return points[:, 0]
 
-    def of_body(body, points):
-        return of_points(points)
-
-    function = of_body if takes_body else of_points
     for _ in range(2):  # without a tag, it is called at each access
         list(with_functions(tmp_path, along=function))
     assert len(calls) == 4
@@ -689,7 +678,7 @@ def test_values_of_a_function_are_cached_under_its_tag(tmp_path, takes_body):
 
 @pytest.mark.parametrize("tag", ["", 1])
 def test_a_tag_that_is_no_text_is_refused(tmp_path, tag):
-    def height(points):
+    def height(body, points):
         return points[:, 2]
 
     height.cache_tag = tag

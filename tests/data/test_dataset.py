@@ -87,7 +87,7 @@ def test_items_are_labelled_and_named(dataset):
 
 def test_functions_of_position_become_attributes(root, tmp_path):
     dataset = SignatureDataset(
-        root, CONFIG, tmp_path / "cache", attributes={"height": lambda points: points[:, 2]}
+        root, CONFIG, tmp_path / "cache", attributes={"height": lambda body, points: points[:, 2]}
     )
     for part in (dataset, dataset.subset([0, 3])):
         for samples in (part[1].signature.interior, part[1].signature.surface):
@@ -96,7 +96,7 @@ def test_functions_of_position_become_attributes(root, tmp_path):
             assert_allclose(height, expected, rtol=1e-6)
     found = SignatureDataset(root, CONFIG, tmp_path / "cache")[0].signature.interior.attributes
     assert found == {}
-    wrong = {"height": lambda points: points[:-1]}
+    wrong = {"height": lambda body, points: points[:-1]}
     broken = SignatureDataset(root, CONFIG, tmp_path / "cache", attributes=wrong)
     with pytest.raises(
         ValueError, match=r"ball/1.off: attributes: height: expected a finite number"
@@ -118,7 +118,10 @@ def test_an_attribute_does_not_stand_in_for_one_of_the_library(root, tmp_path):
         match=r"names other than .*depth.*, got depth=.*of the library are set by SignatureConfig",
     ):
         SignatureDataset(
-            root, CONFIG, tmp_path / "cache", attributes={"depth": lambda points: points[:, 2]}
+            root,
+            CONFIG,
+            tmp_path / "cache",
+            attributes={"depth": lambda body, points: points[:, 2]},
         )
 
 
@@ -528,7 +531,9 @@ def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(root, tmp_p
     assert changed(2.0).cached_keys() != changed(3.0).cached_keys()
     with pytest.raises(ValueError, match="pre_transform: expected attributes with a cache_tag"):
         SignatureDataset(
-            root, attributes={"x": lambda points: points[:, 0]}, pre_transform=FewerSamples(seed=0)
+            root,
+            attributes={"x": lambda body, points: points[:, 0]},
+            pre_transform=FewerSamples(seed=0),
         )
 
 

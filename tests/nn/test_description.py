@@ -220,7 +220,7 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh):
     more.precompute(n_workers=1, progress=False)
     assert asked(more)[0] == ["0", "1", "2"]
     with_own = SignatureDataset(
-        paths, CONFIG, fresh.pipeline.cache_dir, attributes={"height": lambda x: x[:, 2]}
+        paths, CONFIG, fresh.pipeline.cache_dir, attributes={"height": lambda body, x: x[:, 2]}
     )
     assert asked(with_own)[0] == asked(with_own)[0] == ["0", "1", "2"]
     body = icosphere(subdivisions=2)

@@ -1,6 +1,5 @@
 """Additional attributes of samples: values of an image or a field, or of a function of position."""
 
-import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,9 +14,8 @@ from igps.signature.attributes import AttributeName
 from igps.signature.signature import SAMPLE_KINDS, SampleKind, Signature
 
 Values = NDArray[np.floating[Any]]
-PointFunction = Callable[..., Values]
-"""A function of points (P, 3), or of a body and points, to values (P,) or (P, C)."""
-BodyFunction = Callable[[BodyRef, Floats], Values]
+PointFunction = Callable[[BodyRef, Floats], Values]
+"""A function of a body and points (P, 3), in coordinates of its file, to values (P,) or (P, C)."""
 
 
 @runtime_checkable
@@ -41,9 +39,9 @@ class FileSource(Protocol):
 
 @dataclass(frozen=True)
 class FunctionAttribute:
-    """A function `(body, points)` as an attribute source, with a text that identifies the function."""
+    """A function as an attribute source, with a text that identifies the function."""
 
-    function: BodyFunction
+    function: PointFunction
     tag: str
 
     def cache_tag(self, body: BodyRef) -> str:
@@ -54,36 +52,15 @@ class FunctionAttribute:
         return self.function(body, points)
 
 
-@dataclass(frozen=True)
-class OfPoints:
-    """A function of points as a function `(body, points)`."""
-
-    function: Callable[[Floats], Values]
-
-    def __call__(self, body: BodyRef, points: Floats) -> Values:
-        return self.function(points)
-
-
-def _takes_body(function: Callable[..., Any]) -> bool:
-    """Return whether a function has two required positional arguments, body and points."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return False
-    positional = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
-    required = [p for p in parameters if p.kind in positional and p.default is p.empty]
-    return len(required) == 2
-
-
 def split_attributes(
     attributes: Mapping[str, AttributeSource | PointFunction],
-) -> tuple[dict[str, AttributeSource], dict[str, BodyFunction]]:
+) -> tuple[dict[str, AttributeSource], dict[str, PointFunction]]:
     """Split attributes into sources, whose values are cached, and functions, which are called at each access.
 
     A function is a source if its attribute `cache_tag` holds a text.
     """
     sources: dict[str, AttributeSource] = {}
-    functions: dict[str, BodyFunction] = {}
+    functions: dict[str, PointFunction] = {}
     for name, value in attributes.items():
         if not callable(value) or name in get_args(AttributeName):
             raise ValueError(
@@ -96,11 +73,10 @@ def split_attributes(
         if callable(tag):
             sources[name] = given
             continue
-        function = given if _takes_body(given) else OfPoints(given)
         if tag is None:
-            functions[name] = function
+            functions[name] = given
         elif isinstance(tag, str) and tag:
-            sources[name] = FunctionAttribute(function, tag)
+            sources[name] = FunctionAttribute(given, tag)
         else:
             raise ValueError(
                 f"attributes: expected a text, or a method, as cache_tag of {name}, got {tag!r}. "

@@ -60,10 +60,10 @@ class SignatureDataset(Dataset[LabelledSignature]):
         labels: class names of the given paths.
         classes: rule for the class of a body, see `ClassRule`; "folder" if None.
         reading: options for reading files.
-        attributes: additional attributes of the samples by name. Each is an `AttributeSource`, or a function of points
-            `(points)` or `(body, points)`, from (P, 3) in coordinates of the file to (P,) or (P, C). Values of a
-            source are cached. Values of a function are cached if it has an attribute `cache_tag`, a text that you
-            change whenever the function gives other values; otherwise it is called at each access.
+        attributes: additional attributes of the samples by name. Each is an `AttributeSource`, or a function
+            `(body, points)`, from (P, 3) in coordinates of the file to (P,) or (P, C). Values of a source are cached.
+            Values of a function are cached if it has an attribute `cache_tag`, a text that you change whenever the
+            function gives other values; otherwise it is called at each access.
         pre_transform: transform of every Signature before it is cached; its `cache_tag` is part of the cache key.
         transform: transform of a Signature at each access; see `igps.data.transforms`.
 
