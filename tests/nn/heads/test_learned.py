@@ -10,7 +10,6 @@ from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 from igps.nn.heads.two_level import TwoLevelHead
 from igps.nn.heads.wccn import WCCNHead
 from igps.retrieval import chi_square
-from igps.retrieval.distances import euclidean
 
 
 @pytest.fixture
@@ -133,22 +132,6 @@ def test_without_head_it_is_the_paper(histograms):
     assert_close(
         distance(histograms, histograms), chi_square(histograms, histograms), atol=0, rtol=0
     )
-
-
-def test_plain_distance_may_be_another(histograms):
-    flat = histograms.flatten(1)
-    assert_close(
-        BlendedDistance(plain=euclidean)(flat, flat), euclidean(flat, flat), atol=0, rtol=0
-    )
-    head = ProjectionHead(width=4).eval()
-    head(flat)
-    distance = BlendedDistance(head, euclidean, share=0.0)
-    distance.calibrate(flat)
-    expected = (
-        euclidean(flat, flat)
-        / euclidean(flat, flat)[torch.triu_indices(12, 12, 1).unbind()].median()
-    )
-    assert_close(distance(flat, flat), expected)
 
 
 def test_state_round_trips_into_one_without_sizes(histograms):

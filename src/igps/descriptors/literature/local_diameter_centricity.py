@@ -122,16 +122,12 @@ def _cone(n_rays: int, opening_angle: float) -> Floats:
 
 def _robust_mean(lengths: Floats) -> Floats:
     """Mean of the values of each row within a standard deviation of their median; NaN for a row of NaN alone."""
-    means = np.full(len(lengths), np.nan)
-    rows = np.isfinite(lengths).any(axis=1)
-    values = lengths[rows]
-    median = np.nanmedian(values, axis=1, keepdims=True)
-    deviation = np.nanstd(values, axis=1, keepdims=True)
+    values = np.ma.masked_invalid(lengths)
+    median = np.ma.median(values, axis=1, keepdims=True)
+    deviation = values.std(axis=1, keepdims=True)
     # The tolerance keeps lengths that differ from the median by rounding alone.
-    outlier = np.abs(values - median) > deviation + 1e-9 * median
-    trimmed = np.where(outlier, np.nan, values)
+    is_outlier = np.abs(values - median) > deviation + 1e-9 * median
+    trimmed = np.ma.masked_where(is_outlier, values)
     # If an even number of lengths forms two distant groups, none may be near the median. Then all are averaged.
-    is_empty = np.isnan(trimmed).all(axis=1, keepdims=True)
-    averaged = np.where(is_empty, values, trimmed)
-    means[rows] = np.nanmean(averaged, axis=1)
-    return means
+    means = np.ma.where(trimmed.count(axis=1) > 0, trimmed.mean(axis=1), values.mean(axis=1))
+    return np.asarray(means.filled(np.nan))

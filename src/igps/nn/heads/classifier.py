@@ -67,24 +67,15 @@ class ClassifierHead(KernelHead, ClassifyingHead):
     class of a shape is unknown if its strangeness is at least the 95th percentile of held-out shapes.
 
     Args:
-        prior, n_directions, shrinkage, ridge, prior_share, temperature: see `KernelHead`.
+        prior: see `KernelHead`, whose other numbers are its own.
         names: of the classes, in the order of their numbers.
     """
 
     members: Tensor
     calibration: Tensor
 
-    def __init__(
-        self,
-        prior: Head | None = None,
-        n_directions: int = 64,
-        shrinkage: float = 0.3,
-        ridge: float = 0.03,
-        prior_share: float = 1 / 3,
-        temperature: float = 0.05,
-        names: Sequence[str] = (),
-    ) -> None:
-        super().__init__(prior, n_directions, shrinkage, ridge, prior_share, temperature)
+    def __init__(self, prior: Head | None = None, names: Sequence[str] = ()) -> None:
+        super().__init__(prior)
         self.names = tuple(names)
         self.register_buffer("members", torch.zeros(0, dtype=torch.long))
         self.register_buffer("calibration", torch.tensor(0.05))

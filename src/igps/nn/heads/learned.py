@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from igps._parameters import check_at_least
 from igps.nn.heads.base import Head, check_cells, square_roots
-from igps.retrieval.distances import Distance, chi_square
+from igps.retrieval.distances import chi_square
 
 
 class ProjectionHead(Head):
@@ -68,28 +68,24 @@ class ProjectionHead(Head):
 
 
 class BlendedDistance(nn.Module):
-    """A weighted sum of a plain distance and a head's distance, each in units of its median between training shapes.
+    """A weighted sum of the plain distance χ² and a head's distance, each over its median between training shapes.
 
     A head with free parameters specialises in the training classes; the sum with the plain distance can also improve
     the distances of other classes. Without a head, the plain distance is used alone.
 
     Args:
         head: maps descriptions to embeddings; None for the plain distance.
-        plain: maps descriptions (Q, ...) and (G, ...) to distances (Q, G), such as `Descriptor.distances`; χ² if None.
         share: weight of the head's distance, from 0 (only the plain distance) to 1 (only the head's, over its median).
     """
 
     plain_unit: Tensor
     learned_unit: Tensor
 
-    def __init__(
-        self, head: Head | None = None, plain: Distance | None = None, share: float = 0.5
-    ) -> None:
+    def __init__(self, head: Head | None = None, *, share: float = 0.5) -> None:
         super().__init__()
         if not 0 <= share <= 1:
             raise ValueError(f"share: expected a number from 0 to 1, got {share}.")
         self.head = head
-        self.plain = chi_square if plain is None else plain
         self.share = share
         self.register_buffer("plain_unit", torch.ones(()))
         self.register_buffer("learned_unit", torch.ones(()))
@@ -102,14 +98,14 @@ class BlendedDistance(nn.Module):
         pairs = tuple(torch.triu_indices(len(descriptions), len(descriptions), 1))
         embedding = self.head(descriptions)
         for unit, distances in (
-            (self.plain_unit, self.plain(descriptions, descriptions)),
+            (self.plain_unit, chi_square(descriptions, descriptions)),
             (self.learned_unit, self.head.distances(embedding, embedding)),
         ):
             unit.copy_(distances[pairs].median().clamp_min(torch.finfo(distances.dtype).tiny))
 
     def forward(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """Return distances (Q, G) between descriptions (Q, ...) and (G, ...)."""
-        plain = self.plain(queries, gallery)
+        plain = chi_square(queries, gallery)
         if self.head is None:
             return plain
         learned = self.head.distances(self.head(queries), self.head(gallery))
