@@ -45,16 +45,6 @@ class SampleBatch:
         mapped: SampleBatch = tree_map_only(Tensor, function, self)
         return mapped
 
-    def to(
-        self, device: torch.device | str | torch.dtype, non_blocking: bool = False
-    ) -> SampleBatch:
-        """Return the batch on another device or with another floating type, see `torch.Tensor.to`."""
-        if isinstance(device, torch.dtype):
-            return self.map(
-                lambda values: values.to(device) if values.is_floating_point() else values
-            )
-        return self.map(lambda values: values.to(device, non_blocking=non_blocking))
-
     def subset(self, n_samples: int, seed: int | None = None) -> SampleBatch:
         """Return at most `n_samples` samples of each shape.
 
@@ -220,9 +210,13 @@ class SignatureBatch:
 
         Meshes stay on the CPU, and eigenvalues, area and volume in double precision.
         """
-        if isinstance(device, torch.dtype):
-            return replace(self, interior=self.interior.to(device), surface=self.surface.to(device))
-        return self.map(lambda values: values.to(device, non_blocking=non_blocking))
+        if not isinstance(device, torch.dtype):
+            return self.map(lambda values: values.to(device, non_blocking=non_blocking))
+
+        def convert(values: Tensor) -> Tensor:
+            return values.to(device) if values.is_floating_point() else values
+
+        return replace(self, interior=self.interior.map(convert), surface=self.surface.map(convert))
 
     def pin_memory(self) -> SignatureBatch:
         """Return the batch in pinned memory; `DataLoader(pin_memory=True)` calls this method."""

@@ -97,16 +97,14 @@ def fill(
     )
     n_found = len(bodies) - len(missing)
     bar = Progress(total=len(bodies), initial=n_found, desc="signatures", disable=not progress)
-    is_visible = False
     with bar, contextlib.closing(outcomes):
         for i, outcome in outcomes:
             bar.update()
             if isinstance(outcome, Failed):
                 fail(i, outcome)
                 continue
-            if not is_visible:
+            if executor is not None:
                 wait_until_visible(pipeline, outcome)
-                is_visible = True
             hits[i] = outcome
     line = left_out(failure.summary for failure in failures.values())
     if line:
