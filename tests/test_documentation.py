@@ -25,6 +25,7 @@ from igps.cli.commands import command_of, load_command
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES
 from igps.shapes import ArticulatedShapes
+from page_packages import install
 from paper_histogram import paper_histogram
 
 PROJECT = Path(__file__).parents[1]
@@ -75,30 +76,15 @@ def shared_cache(tmp_path_factory):
 
 
 @pytest.fixture
-def folder(tmp_path, here, monkeypatch, shared_cache):
+def folder(here, on_path, shared_cache):
     """The current folder, on the path of Python, whose cache is shared. What is imported from it is forgotten."""
-    (tmp_path / "cache").symlink_to(shared_cache)
-    monkeypatch.syspath_prepend(tmp_path)
+    (here / "cache").symlink_to(shared_cache)
     before = set(sys.modules)
-    yield tmp_path
+    yield here
     for name in set(sys.modules) - before:
         file = getattr(sys.modules[name], "__file__", None)
-        if file and Path(file).is_relative_to(tmp_path):
+        if file and Path(file).is_relative_to(here):
             del sys.modules[name]
-
-
-def install(pyproject, folder):
-    """Make the entry points of a package known to programs that have the folder on their path."""
-    project = tomllib.loads(pyproject)["project"]
-    information = folder / f"{project['name']}-{project['version']}.dist-info"
-    information.mkdir()
-    head = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
-    (information / "METADATA").write_text(head)
-    lines = []
-    for group, entries in project["entry-points"].items():
-        lines.append(f"[{group}]")
-        lines += [f"{name} = {place}" for name, place in entries.items()]
-    (information / "entry_points.txt").write_text("\n".join(lines))
 
 
 def program(page, folder):

@@ -15,7 +15,6 @@ from igps.analysis.clusters import clusters_of
 from igps.analysis.groups import group_test
 from igps.analysis.map import body_map
 from igps.analysis.outliers import LIMIT
-from igps.cli.explain_command import _extent
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
 from igps.report.figures import clusters_figure, map_figure, write_analysis
@@ -420,24 +419,6 @@ def test_explain_shows_the_ends_of_an_axis_of_the_map(root, tmp_path, capsys):
     (end, other) = sorted(found)
     assert other == "short0.off"
     assert end in {f"long{i}.off" for i in range(6)}
-
-
-def test_half_of_a_share_lies_on_a_part_of_the_area_however_small_its_faces_are():
-    """Nearly even over a cap of a ball, a quarter of its area, and zero elsewhere; faces are even, or crowded there."""
-    rings = {
-        "even": np.linspace(0, np.pi, 121),
-        "crowded": np.r_[np.linspace(0, 0.4, 161), np.linspace(0.4, np.pi, 81)[1:]],
-    }
-    for angles in rings.values():
-        profile = np.column_stack([np.sin(angles), np.cos(angles)])
-        profile[[0, -1], 0] = 0
-        ball = trimesh.creation.revolve(profile[::-1], sections=72)
-        heights = ball.triangles_center[:, 2]
-        sentence = _extent(np.where(heights > 0.5, 1 + 1e-6 * heights, 0), ball.area_faces)
-        percent = float(
-            sentence.removeprefix("half of its share lies on ").removesuffix("% of its surface")
-        )
-        assert percent == pytest.approx(12.5, abs=0.6)  # of two digits
 
 
 def test_clusters_are_the_two_kinds_of_eggs(root, tmp_path, here, capsys):

@@ -1,7 +1,6 @@
 """`igps report` and `--report`: the page is made with the results, or of their folder afterwards."""
 
-from __future__ import annotations
-
+import contextlib
 import json
 import re
 from pathlib import Path
@@ -167,8 +166,8 @@ def test_bodies_named_by_a_table_elsewhere_have_pictures(tmp_path: Path, here, m
         *words,
         *options(tmp_path / "out"),
     )
-    monkeypatch.chdir("/")
-    run("report", tmp_path / "out", "--n_workers", 1)
+    with contextlib.chdir("/"):
+        run("report", tmp_path / "out", "--n_workers", 1)
     names = {f"{subject}.nii.gz#{body}" for subject in range(2) for body in ("block", "bar")}
     shapes = data_of(tmp_path / "out" / "report.html")["shapes"]
     assert {shape["name"] for shape in shapes if "surface" in shape} == names

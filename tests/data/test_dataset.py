@@ -232,8 +232,9 @@ def test_a_missing_file_is_a_failure_like_any_other(root, tmp_path):
 
 def test_two_processes_on_one_cache(root, tmp_path):
     datasets = [SignatureDataset(root, CONFIG, tmp_path / "cache") for _ in range(2)]
+    in_a_process = {"n_workers": 1, "limits": Limits(seconds=600), "progress": False}
     with ThreadPoolExecutor(2) as pool:
-        results = list(pool.map(lambda d: d.precompute(n_workers=2, progress=False), datasets))
+        results = list(pool.map(lambda one: one.precompute(**in_a_process), datasets))
     assert results == [[], []]
     files = [path for path in (tmp_path / "cache" / "signatures").rglob("*") if path.is_file()]
     assert len(files) == 4

@@ -1,44 +1,22 @@
 """The example of the page *Add a descriptor*, as another package would install it."""
 
-import re
-import tomllib
-from pathlib import Path
-
 import pytest
 
 import igps
 from igps.signature.signature import SignatureConfig
+from page_packages import files_of_page, install_page
 
-PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "add-descriptor.md"
-
-
-def file_of_the_page(name):
-    """The text of the block whose title is this file."""
-    pattern = rf'^```\w+ title="{re.escape(name)}"\n(.*?)^```'
-    match = re.search(pattern, PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-    assert match is not None
-    return match[1]
+PAGE = "add-descriptor.md"
 
 
 @pytest.fixture
 def installed(on_path):
     """The package of the page, laid out on the Python path as pip would do it."""
-    project = tomllib.loads(file_of_the_page("pyproject.toml"))["project"]
-    (on_path / "mine.py").write_text(file_of_the_page("mine.py"))
-    info = on_path / f"{project['name']}-{project['version']}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
-    )
-    lines = []
-    for group, places in project["entry-points"].items():
-        lines.append(f"[{group}]")
-        lines += [f"{name} = {place}" for name, place in places.items()]
-    (info / "entry_points.txt").write_text("\n".join(lines))
+    install_page(PAGE, on_path)
 
 
 def test_the_example_is_short():
-    text = file_of_the_page("mine.py") + file_of_the_page("pyproject.toml")
+    text = "".join(files_of_page(PAGE).values())
     assert len(text.splitlines()) <= 30
 
 

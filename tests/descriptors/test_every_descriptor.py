@@ -189,7 +189,7 @@ class Counting(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("name", ON_TENSORS)
-def test_a_batch_on_a_device_is_described_at_once(name, monkeypatch):
+def test_a_batch_on_a_device_is_described_at_once(name, request, monkeypatch):
     """The number of operations does not depend on the number of bodies; descriptions equal those of single bodies."""
     found = descriptor(name)
     pair = SignatureBatch.concatenate(
@@ -197,7 +197,7 @@ def test_a_batch_on_a_device_is_described_at_once(name, monkeypatch):
     )
     with torch.inference_mode():
         expected = torch.cat([found(pair[:1]), found(pair[1:])] * 3)
-    monkeypatch.setattr("igps.nn._kernels.batches.uses_loops", lambda _: False)
+    request.getfixturevalue("without_loops")
     for block in ("batches.BLOCK", "pairs_by_torch._BLOCK"):  # all fit
         monkeypatch.setattr(f"igps.nn._kernels.{block}", 2**40)
     counts = []

@@ -1,5 +1,6 @@
 """Each line of the table of pipelines does what its page says."""
 
+import contextlib
 import os
 import re
 from pathlib import Path
@@ -76,19 +77,18 @@ def test_there_are_twenty_things_that_work_and_reasons_for_the_rest():
 
 @pytest.mark.parametrize("number", [number for number in ROWS if number != 4])
 def test_a_line_of_the_table_works(space, number, monkeypatch):
-    monkeypatch.chdir(space["folder"])
     monkeypatch.setattr("igps.data.dataset.default_cache_dir", lambda: space["folder"] / "cache")
     torch.compiler.reset()
     torch.manual_seed(0)
-    found = eval(ROWS[number][1], space)
+    with contextlib.chdir(space["folder"]):
+        found = eval(ROWS[number][1], space)
     if number in NOTHING_COMES_BACK:
         assert found is None
     else:
         assert CHECKS[number](found, space), ROWS[number][0]
 
 
-def test_a_transform_is_set_and_taken_away(space, monkeypatch):
-    monkeypatch.chdir(space["folder"])
+def test_a_transform_is_set_and_taken_away(space):
     dataset = space["dataset"]
     whole = len(dataset[0].signature.interior)
     exec(ROWS[4][1], space)

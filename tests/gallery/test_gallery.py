@@ -1,5 +1,6 @@
 """A gallery of meshes against the comparison with each of them."""
 
+import contextlib
 import json
 import os
 from pathlib import Path
@@ -494,7 +495,7 @@ def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
     assert "ct: expected centres, got 8 quantiles that are not fitted" in told
 
 
-def test_a_gallery_remembers_the_table_of_names(tmp_path, here, monkeypatch, capsys):
+def test_a_gallery_remembers_the_table_of_names(tmp_path, here, capsys):
     """As how files are read; another one may be given, as where it was moved to."""
     save_labels(tmp_path / "scans" / "scan.nii.gz", block_and_bar())
     (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')
@@ -503,14 +504,14 @@ def test_a_gallery_remembers_the_table_of_names(tmp_path, here, monkeypatch, cap
     build = ["gallery", "build", "scans", "--out", "g.igps", "--descriptor", INTERIOR, *SMALL]
     run(*build, "--size", "ignore", "--names", "names.json", *cache)
     (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")
     cache = ["--cache_dir", "../cache", "--n_workers", 1]
     query = ["query", "../scans/scan.nii.gz#bar", "--gallery", "../g.igps", "--top", 1]
-    run(*query, *cache)
-    assert "scan.nii.gz#bar" in capsys.readouterr().out
-    sync_again = ["gallery", "sync", "../scans", "--gallery", "../g.igps", *cache]
-    run(*sync_again)
-    assert "0 bodies described, 0 removed" in capsys.readouterr().out
-    run(*sync_again, "--names", "../other.json")
-    assert "1 removed" in capsys.readouterr().out
-    assert {row["part"] for row in Gallery("../g.igps").rows("part")} == {"cube", "bar"}
+    with contextlib.chdir(tmp_path / "elsewhere"):
+        run(*query, *cache)
+        assert "scan.nii.gz#bar" in capsys.readouterr().out
+        sync_again = ["gallery", "sync", "../scans", "--gallery", "../g.igps", *cache]
+        run(*sync_again)
+        assert "0 bodies described, 0 removed" in capsys.readouterr().out
+        run(*sync_again, "--names", "../other.json")
+        assert "1 removed" in capsys.readouterr().out
+    assert {row["part"] for row in Gallery("g.igps").rows("part")} == {"cube", "bar"}

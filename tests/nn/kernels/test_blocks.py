@@ -30,8 +30,9 @@ def bodies(*copies):
         ((50, 40, 45), True, [(3, 2000)]),
     ],
 )
-def test_groups_are_padded_to_their_largest_body(copies, on_cpu, widths, monkeypatch):
-    monkeypatch.setattr("igps.nn._kernels.batches.uses_loops", lambda device: on_cpu)
+def test_groups_are_padded_to_their_largest_body(copies, on_cpu, widths, request):
+    if not on_cpu:
+        request.getfixturevalue("without_loops")
     batch = bodies(*copies)
     found = []
 
