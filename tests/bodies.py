@@ -32,7 +32,11 @@ def interior_points(mesh, n, seed=0):
     vertices, faces = mesh
     low = vertices.min(0)
     high = vertices.max(0)
-    points = np.random.default_rng(seed).uniform(low, high, (8 * n, 3))
+    points = np.random.default_rng(seed).uniform(
+        low,
+        high,
+        (8 * n, 3),
+    )
     return points[igl.winding_number(vertices, faces, points) > 0.5][:n]
 
 
@@ -40,13 +44,24 @@ def exterior_points(mesh, n, seed=0):
     vertices, faces = mesh
     low = 2 * vertices.min(0)
     high = 2 * vertices.max(0)
-    points = np.random.default_rng(seed).uniform(low, high, (8 * n, 3))
+    points = np.random.default_rng(seed).uniform(
+        low,
+        high,
+        (8 * n, 3),
+    )
     return points[igl.winding_number(vertices, faces, points) < 0.5][:n]
 
 
 def smooth_functions(vertices):
     x, y, z = vertices.T
-    functions = [np.sin(2 * x), np.cos(3 * y + x), x * y * z, np.exp(z), np.sin(5 * z) * x, x]
+    functions = [
+        np.sin(2 * x),
+        np.cos(3 * y + x),
+        x * y * z,
+        np.exp(z),
+        np.sin(5 * z) * x,
+        x,
+    ]
     return np.stack(functions, axis=1)
 
 

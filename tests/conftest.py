@@ -19,8 +19,18 @@ torch.set_num_threads(1)
 SHARED = Path(__file__).parents[2] / "shared"
 
 
-TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
-FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+TETRAHEDRON = np.array(
+    [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    dtype=float,
+)
+FACES = np.array(
+    [
+        [0, 2, 1],
+        [0, 1, 3],
+        [1, 2, 3],
+        [0, 3, 2],
+    ]
+)
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -98,7 +108,11 @@ def torch_threads(n_threads):
 
 
 def as_mesh(surface, name="mesh"):
-    return Mesh(np.asarray(surface.vertices), np.asarray(surface.faces), name=name)
+    return Mesh(
+        np.asarray(surface.vertices),
+        np.asarray(surface.faces),
+        name=name,
+    )
 
 
 def as_trimesh(mesh):
@@ -111,9 +125,15 @@ def horseshoe(half_gap=0.05, tube=0.3, n_sections=48, n_around=14):
     u = np.linspace(half_gap, 2 * np.pi - half_gap, n_sections)[:, None]
     v = np.arange(n_around)[None, :] * (2 * np.pi / n_around)
     radius = 1 + tube * jitter * np.cos(v)
-    ring = np.stack([radius * np.cos(u), radius * np.sin(u), tube * jitter * np.sin(v)], axis=2)
+    ring = np.stack(
+        [radius * np.cos(u), radius * np.sin(u), tube * jitter * np.sin(v)],
+        axis=2,
+    )
     ring = ring.reshape(-1, 3)
-    ends = np.stack([np.cos(u[[0, -1], 0]), np.sin(u[[0, -1], 0]), np.zeros(2)], axis=1)
+    ends = np.stack(
+        [np.cos(u[[0, -1], 0]), np.sin(u[[0, -1], 0]), np.zeros(2)],
+        axis=1,
+    )
     i, j = np.mgrid[: n_sections - 1, :n_around]
     a = i * n_around + j
     b = i * n_around + (j + 1) % n_around
@@ -123,8 +143,14 @@ def horseshoe(half_gap=0.05, tube=0.3, n_sections=48, n_around=14):
     there = (here + 1) % n_around
     last = (n_sections - 1) * n_around
     n = n_sections * n_around
-    first_cap = np.stack([here, there, np.full(n_around, n)], axis=1)
-    last_cap = np.stack([last + there, last + here, np.full(n_around, n + 1)], axis=1)
+    first_cap = np.stack(
+        [here, there, np.full(n_around, n)],
+        axis=1,
+    )
+    last_cap = np.stack(
+        [last + there, last + here, np.full(n_around, n + 1)],
+        axis=1,
+    )
     parts = (lower, upper, first_cap, last_cap)
     faces = np.concatenate([part.reshape(-1, 3) for part in parts])
     return Mesh(np.concatenate([ring, ends]), faces, name="horseshoe")

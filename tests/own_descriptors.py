@@ -111,7 +111,11 @@ class Same(igps.BodyDescriptor):
     source = "nobody"
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:
-        return np.full(1, np.nan if body.id.endswith("nan.off") else 0, dtype=np.float32)
+        return np.full(
+            1,
+            np.nan if body.id.endswith("nan.off") else 0,
+            dtype=np.float32,
+        )
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         return 0 * (queries - gallery.T)

@@ -35,7 +35,11 @@ def main():
         (source,) = (folder / "dist").glob("*.tar.gz")
         # Lightning needs a setuptools that still has pkg_resources in its lowest versions
         pins = {"lowest": [*lowest(project["dependencies"]), "setuptools<81"], "newest": []}
-        for (which, constraints), archive in zip(pins.items(), (wheel, source), strict=True):
+        for (which, constraints), archive in zip(
+            pins.items(),
+            (wheel, source),
+            strict=True,
+        ):
             place = folder / which
             venv.create(place, with_pip=True)
             python = str(place / "bin" / "python")

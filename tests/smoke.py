@@ -26,7 +26,10 @@ assert Path(igps.__file__).is_relative_to(Path(there).resolve()), igps.__file__
 
 with tempfile.TemporaryDirectory() as name:
     folder = Path(name)
-    for (kind, length), number in itertools.product({"long": 3.0, "short": 1.0}.items(), range(2)):
+    for (kind, length), number in itertools.product(
+        {"long": 3.0, "short": 1.0}.items(),
+        range(2),
+    ):
         box = trimesh.creation.box([1.0, 1.2 + 0.1 * number, length])
         for _ in range(4):
             box = box.subdivide()

@@ -49,7 +49,13 @@ def started(folder, code):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     environment["NUMBA_CACHE_DIR"] = str(folder)
     command = [sys.executable, "-c", code]
-    return subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command,
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
 
 
 def test_loops_of_an_earlier_version_are_compiled_anew(tmp_path):

@@ -169,7 +169,12 @@ def test_a_job_that_needs_too_much_memory_is_named(limited):
 @pytest.mark.skipif(not LINUX, reason="Linux alone enforces a memory limit")
 def test_a_limit_below_what_python_itself_takes_is_to_be_raised():
     with pytest.raises(MachineError, match="raise the memory_limit"):
-        all_of(jobs.call, [len], n_workers=1, limits=Limits(memory=2**20))
+        all_of(
+            jobs.call,
+            [len],
+            n_workers=1,
+            limits=Limits(memory=2**20),
+        )
 
 
 def test_a_worker_keeps_the_memory_of_one_body_for_the_next(limited):
@@ -202,7 +207,13 @@ def test_the_machine_is_not_the_jobs_fault(where, job, message):
     limits = Limits(seconds=100) if where == "workers" else None
     with ThreadPoolExecutor(1) as pool:
         executor = pool if where == "executor" else None
-        results = run(jobs.call, [job] * 3, n_workers=1, executor=executor, limits=limits)
+        results = run(
+            jobs.call,
+            [job] * 3,
+            n_workers=1,
+            executor=executor,
+            limits=limits,
+        )
         with pytest.raises(MachineError, match=message):
             list(results)
 
@@ -239,12 +250,24 @@ def test_an_executor_has_limits_of_its_own():
         ThreadPoolExecutor(1) as pool,
         pytest.raises(ValueError, match="limits: expected None with an executor"),
     ):
-        list(run(jobs.square, [1], executor=pool, limits=Limits(seconds=1)))
+        list(
+            run(
+                jobs.square,
+                [1],
+                executor=pool,
+                limits=Limits(seconds=1),
+            )
+        )
 
 
 def test_a_caller_that_takes_its_time_costs_no_job_its_result():
     found = []
-    for number, result in run(jobs.sleep, [0.1, 0.6], n_workers=2, limits=Limits(seconds=1)):
+    for number, result in run(
+        jobs.sleep,
+        [0.1, 0.6],
+        n_workers=2,
+        limits=Limits(seconds=1),
+    ):
         found.append((number, result))
         time.sleep(1.5)
     assert found == [(0, 0.1), (1, 0.6)]

@@ -75,7 +75,10 @@ def test_rich_features_bring_their_attributes(paths, tmp_path):
 
 def test_pipeline_classifies(paths, features):
     labels = [path.parent.name for path in paths]
-    pipeline = make_pipeline(features, KNeighborsClassifier(1)).fit(paths[::2], labels[::2])
+    pipeline = make_pipeline(features, KNeighborsClassifier(1)).fit(
+        paths[::2],
+        labels[::2],
+    )
     found = pipeline.score(paths[1::2], labels[1::2])
     assert found == 1
 
@@ -127,7 +130,11 @@ def test_a_name_is_a_descriptor_with_its_needs(paths, tmp_path):
 
 def test_descriptions_that_are_no_histograms_are_given_as_they_are(paths, tmp_path):
     features = VolumetricFeatures(D2(), config=CONFIG, cache_dir=tmp_path, n_workers=1)
-    expected = describe(SignatureDataset(paths[:2], CONFIG, tmp_path), D2(), n_workers=1)
+    expected = describe(
+        SignatureDataset(paths[:2], CONFIG, tmp_path),
+        D2(),
+        n_workers=1,
+    )
     found = features.transform(paths[:2])
     assert_allclose(found, expected, atol=1e-6)
 
@@ -212,7 +219,10 @@ def mesh_of_row(row):
     """An ellipsoid whose half axes tell the first numbers of the row."""
     numbers = np.resize(np.frombuffer(row), 3)
     surface = trimesh.creation.icosphere(subdivisions=1)
-    return Mesh(np.asarray(surface.vertices) * (1.5 + np.tanh(numbers)), np.asarray(surface.faces))
+    return Mesh(
+        np.asarray(surface.vertices) * (1.5 + np.tanh(numbers)),
+        np.asarray(surface.faces),
+    )
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.SkipTestWarning")

@@ -136,7 +136,12 @@ def test_threads_that_overlap_leave_each_other_as_they_were():
         worker.start()
     for worker in workers:
         worker.join()
-    expected = [(4, 1, 4), (5, 1, 5), (6, 1, 6), (7, 1, 7)]
+    expected = [
+        (4, 1, 4),
+        (5, 1, 5),
+        (6, 1, 6),
+        (7, 1, 7),
+    ]
     assert sorted(found) == expected
     assert torch.get_num_threads() == before[0]
     assert blas() == before[2]
@@ -265,7 +270,12 @@ def test_calls_on_a_body_leave_the_settings(blob):
     with pytest.raises(ValueError, match="expected at least 10002 vertices"):
         igps.compute_signature(blob, SignatureConfig(n_eigenpairs=10_000))
     with ThreadPoolExecutor(3) as pool:
-        others = list(pool.map(lambda _: igps.compute_signature(blob, CONFIG), range(3)))
+        others = list(
+            pool.map(
+                lambda _: igps.compute_signature(blob, CONFIG),
+                range(3),
+            )
+        )
     expected = signature.interior.eigenfunctions
     for other in others:
         assert_array_equal(other.interior.eigenfunctions, expected)

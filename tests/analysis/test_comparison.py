@@ -44,7 +44,12 @@ def test_result_is_what_heights_give(dataset):
     result = run(dataset, Height("tall"))["tall"]
     heights = torch.tensor([1.0, 1.1, 2.3, 2.2, 2.4, 2.6]) * 2
     assert result.distances is not None
-    assert_close(result.distances, (heights[:, None] - heights).abs(), atol=1e-5, rtol=0)
+    assert_close(
+        result.distances,
+        (heights[:, None] - heights).abs(),
+        atol=1e-5,
+        rtol=0,
+    )
     assert result.names == dataset.bodies.names
     assert result.labels == ("ball", "ball", "ball", "egg", "egg", "egg")
     row = result.row()
@@ -134,7 +139,13 @@ def test_signatures_without_what_a_descriptor_needs_are_refused_before_work(data
     with pytest.raises(
         ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 20"
     ):
-        next(compare(dataset, [Height(), descriptor("interior")], progress=False))
+        next(
+            compare(
+                dataset,
+                [Height(), descriptor("interior")],
+                progress=False,
+            )
+        )
 
 
 def test_two_of_one_name_are_refused(dataset):
@@ -142,7 +153,13 @@ def test_two_of_one_name_are_refused(dataset):
     with pytest.raises(
         ValueError, match=r"descriptors: expected different names, got d2 more than once"
     ):
-        next(compare(dataset, [D2(), Height(), changed(D2(), n_bins=8)], progress=False))
+        next(
+            compare(
+                dataset,
+                [D2(), Height(), changed(D2(), n_bins=8)],
+                progress=False,
+            )
+        )
 
 
 def test_collection_without_classes_is_refused(root):

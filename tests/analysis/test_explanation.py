@@ -53,7 +53,12 @@ def described_by(name):
     histograms = HistogramDescriptor([PairHistogram(), PairHistogram(["interior_distance"])])
     cells = torch.rand(12, 704).pow(4)
     return EmbeddedDescriptor(
-        histograms, WhitenedHead().fit(cells, torch.arange(12) // 3, histograms.part_cells)
+        histograms,
+        WhitenedHead().fit(
+            cells,
+            torch.arange(12) // 3,
+            histograms.part_cells,
+        ),
     )
 
 
@@ -104,7 +109,10 @@ def test_of_bodies_that_differ_in_size_alone_all_is_size(signatures):
             eigenfunctions=one.surface.eigenfunctions / 2,
         ),
     )
-    found = explain(descriptor("interior+size"), *(collate([each]) for each in (one, larger)))
+    found = explain(
+        descriptor("interior+size"),
+        *(collate([each]) for each in (one, larger)),
+    )
     apart = 5 * np.log(2)
     nearness = 0.017 / 4  # a quarter of the scale of `interior`
     assert found.distance == pytest.approx(nearness * apart / 0.5, rel=1e-5)
@@ -119,8 +127,17 @@ def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(batches):
     chosen = HistogramDescriptor(PairHistogram(["interior_distance"]))
     found = explain(chosen, *batches)
     cells = [chosen(batch).flatten().double().numpy() for batch in batches]
-    units = np.where(sum(cells) > 0, (cells[0] - cells[1]) / np.maximum(sum(cells), 1e-300) / 2, 0)
-    for batch, sign, shares in zip(batches, (1, -1), found.samples, strict=True):
+    units = np.where(
+        sum(cells) > 0,
+        (cells[0] - cells[1]) / np.maximum(sum(cells), 1e-300) / 2,
+        0,
+    )
+    for batch, sign, shares in zip(
+        batches,
+        (1, -1),
+        found.samples,
+        strict=True,
+    ):
         points = (batch.interior.eigenfunctions[0] / batch.eigenvalues[0].sqrt()).double()
         away = torch.cdist(points, points).numpy()
         place = np.clip(away / (4.0 / 64) - 0.5, 0, 63)
@@ -140,7 +157,10 @@ def test_shares_of_a_squared_euclidean_distance_are_products(batches):
             own, other = (rows.flatten(1).sqrt() @ matrix for rows in (queries, gallery))
             return torch.cdist(own, other) ** 2
 
-    one, other = torch.tensor([[0.1, 0.4, 0.5, 0.0], [0.3, 0.0, 0.2, 0.5]], dtype=torch.float64)
+    one, other = torch.tensor(
+        [[0.1, 0.4, 0.5, 0.0], [0.3, 0.0, 0.2, 0.5]],
+        dtype=torch.float64,
+    )
     units, distance = unit_shares(Squared(PairHistogram()), one, other)
     matrix = torch.linspace(-1, 2, 12, dtype=torch.float64).view(4, 3)
     apart = one.sqrt() - other.sqrt()
@@ -165,13 +185,23 @@ def test_shares_behind_a_head_are_those_of_small_steps(name, batches):
     shares = units * (cells[0] - cells[1])
     order = shares.abs().argsort(descending=True)
     assert (shares[order[:51]] != 0).all()
-    for cell in [*order[[0, 1, 2, 5, 20, 50]].tolist(), int(half.abs().argmax())]:
+    for cell in [
+        *order[[0, 1, 2, 5, 20, 50]].tolist(),
+        int(half.abs().argmax()),
+    ]:
         step = torch.zeros_like(half)
         step[cell] = 1e-4 * half[cell]
         share = 0.0
         for along in (torch.arange(100) + 0.5) / 100:
             ends = torch.stack([middle + along * half, middle - along * half])
-            moved = torch.stack([ends[0] + step, ends[1] - step, ends[0] - step, ends[1] + step])
+            moved = torch.stack(
+                [
+                    ends[0] + step,
+                    ends[1] - step,
+                    ends[0] - step,
+                    ends[1] + step,
+                ]
+            )
             with torch.no_grad():
                 vectors = chosen.head(moved.square())
                 apart = chosen.distances(vectors[[0, 2]], vectors[[1, 3]]).diagonal()
@@ -205,7 +235,13 @@ def test_a_bump_is_painted_where_it_is(signatures, batches):
     places = {kind: getattr(signatures[1], kind).points for kind in ("interior", "surface")}
     points = places["surface"]
     values = share_density(found.samples[1], places, points)
-    at_bump = norm(points - points[points[:, 0].argmax()], axis=1) < 0.25
+    at_bump = (
+        norm(
+            points - points[points[:, 0].argmax()],
+            axis=1,
+        )
+        < 0.25
+    )
     assert values[at_bump].mean() > 2 * abs(values[~at_bump].mean())
 
 
@@ -221,16 +257,35 @@ def test_a_small_bump_or_dent_is_painted_in_another_pose(height):
     bent.vertices += swell[:, None] * straight.vertex_normals
     angle = bent.vertices[:, 2] / 4
     along = 4 + bent.vertices[:, 0]
-    turned = [along * np.cos(angle), bent.vertices[:, 1], along * np.sin(angle)]
+    turned = [
+        along * np.cos(angle),
+        bent.vertices[:, 1],
+        along * np.sin(angle),
+    ]
     bent.vertices = np.stack(turned, axis=1)
     config = descriptor("rich").requirements.apply_to(replace(CONFIG, n_surface_samples=800))
     pair = [compute_signature(as_mesh(one), config) for one in (straight, bent)]
-    found = explain(descriptor("interior"), *(collate([one]) for one in pair))
+    found = explain(
+        descriptor("interior"),
+        *(collate([one]) for one in pair),
+    )
     points = pair[1].surface.points
-    true = norm(points - bent.vertices[away.argmin()], axis=1) < 0.4
+    true = (
+        norm(
+            points - bent.vertices[away.argmin()],
+            axis=1,
+        )
+        < 0.4
+    )
     places = {"interior": pair[1].interior.points, "surface": points}
     assert found.places is not None
-    assert roc_auc_score(true, share_density(found.places[1], places, points)) > 0.9
+    assert (
+        roc_auc_score(
+            true,
+            share_density(found.places[1], places, points),
+        )
+        > 0.9
+    )
 
 
 def test_equal_bodies_have_nothing_to_share(batches):
@@ -266,14 +321,28 @@ def test_groups_are_explained_by_the_cells_that_are_held(batches):
     rows = torch.cat([chosen(batch) for batch in batches]).flatten(1)
     noise = 1 + 0.05 * torch.rand(2, 8, rows.shape[1], generator=torch.Generator().manual_seed(1))
     groups = rows[:, None] * noise
-    found, kept = explain_groups(chosen, groups[0], groups[1], batches, n_permutations=199)
+    found, kept = explain_groups(
+        chosen,
+        groups[0],
+        groups[1],
+        batches,
+        n_permutations=199,
+    )
     assert 0 < kept.sum() < len(kept)
     means = groups.double().mean(dim=1)
     terms = (means[0] - means[1]) ** 2 / (means[0] + means[1]).clamp_min(1e-300) / 2
-    expected = pytest.approx(float(terms[kept].sum()), rel=1e-6)
+    expected = pytest.approx(
+        float(terms[kept].sum()),
+        rel=1e-6,
+    )
     assert found.distance == expected
     with pytest.raises(ValueError, match="3 and 3 bodies can be arranged in only 10 ways"):
-        explain_groups(chosen, groups[0, :3], groups[1, :3], batches)
+        explain_groups(
+            chosen,
+            groups[0, :3],
+            groups[1, :3],
+            batches,
+        )
 
 
 def test_groups_that_differ_in_size_alone_differ_in_size(batches):

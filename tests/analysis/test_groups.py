@@ -39,7 +39,10 @@ def whitened_kernel(vectors):
     return np.exp(-squares / (2 * median))
 
 
-@pytest.mark.parametrize(("is_confounded", "n_numbers"), [(False, 6), (True, 40)])
+@pytest.mark.parametrize(
+    ("is_confounded", "n_numbers"),
+    [(False, 6), (True, 40)],
+)
 def test_without_a_difference_one_test_in_twenty_rejects(is_confounded, n_numbers):
     """Of 1,000 draws; also where a covariate that differs between the groups, and the strata, cause a difference."""
     random = default_rng(1)
@@ -52,7 +55,10 @@ def test_without_a_difference_one_test_in_twenty_rejects(is_confounded, n_number
             scanner = random.integers(0, 2, 24)
             vectors[:, :2] += np.outer(age, [2, 1])
             vectors += 2 * scanner[:, None]
-            given = {"covariates": age[:, None], "strata": [str(one) for one in scanner]}
+            given = {
+                "covariates": age[:, None],
+                "strata": [str(one) for one in scanner],
+            }
         test = quick(vectors, seed=draw, **given)
         found.append((test.permanova_p, test.kernel_p))
     rejected = (np.array(found, dtype=float) <= 0.05).mean(axis=0)
@@ -66,7 +72,10 @@ def test_the_unit_of_a_covariate_does_not_matter():
     vectors = random.normal(size=(24, 3)) + np.outer(age, [2, 1, 0])
     usual = quick(vectors, covariates=age[:, None])
     for other in (1e-15 * age, 1e15 * age):
-        found = quick(vectors, covariates=np.stack([other, np.full(24, 1e15 / 3)], axis=1))
+        found = quick(
+            vectors,
+            covariates=np.stack([other, np.full(24, 1e15 / 3)], axis=1),
+        )
         assert found.permanova_f == pytest.approx(usual.permanova_f)
         assert found.permanova_p == usual.permanova_p
 
@@ -76,16 +85,28 @@ def test_numbers_that_are_none_are_refused():
     with pytest.raises(ValueError, match="n_permutations: expected at least 1, got -3"):
         quick(vectors, n_permutations=-3)
     with pytest.raises(ValueError, match="covariates: expected finite numbers"):
-        quick(vectors, covariates=np.full((24, 1), np.nan))
+        quick(
+            vectors,
+            covariates=np.full((24, 1), np.nan),
+        )
     with pytest.raises(ValueError, match="vectors: expected finite numbers"):
-        quick(np.where(np.arange(24)[:, None] == 2, np.inf, vectors))
+        quick(
+            np.where(
+                np.arange(24)[:, None] == 2,
+                np.inf,
+                vectors,
+            )
+        )
 
 
 def test_power_grows_with_the_difference():
     random = default_rng(2)
     powers = []
     for shift in (0.0, 0.7, 1.4, 2.8):
-        apart = np.outer(np.repeat([0, 1], 12), [shift, 0, 0, 0])
+        apart = np.outer(
+            np.repeat([0, 1], 12),
+            [shift, 0, 0, 0],
+        )
         tests = [quick(random.normal(size=(24, 4)) + apart) for _ in range(60)]
         by_means = np.mean([one.permanova_p <= 0.05 for one in tests])
         by_kernel = np.mean([one.kernel_p <= 0.05 for one in tests])
@@ -97,9 +118,16 @@ def test_power_grows_with_the_difference():
 def test_the_kernel_test_finds_a_small_direction_that_distances_drown():
     random = default_rng(9)
     scales = np.array([10.0, 5, 2, 1, 1])
-    shift = np.outer(np.repeat([0, 1], 20), [0, 0, 0, 2.0, 0])
+    shift = np.outer(
+        np.repeat([0, 1], 20),
+        [0, 0, 0, 2.0, 0],
+    )
     tests = [
-        quick(random.normal(size=(40, 5)) * scales + shift, ["a"] * 20 + ["b"] * 20, i)
+        quick(
+            random.normal(size=(40, 5)) * scales + shift,
+            ["a"] * 20 + ["b"] * 20,
+            i,
+        )
         for i in range(60)
     ]
     assert np.mean([one.permanova_p <= 0.05 for one in tests]) < 0.2
@@ -112,7 +140,12 @@ def test_a_covariate_that_causes_all_the_difference_explains_it():
     vectors = np.outer(age, [1.0, 0.5, 0, 0]) + 0.3 * random.normal(size=(60, 4))
     groups = ["young"] * 30 + ["old"] * 30
     alone = group_test(vectors, groups, n_permutations=999)
-    explained = group_test(vectors, groups, covariates=age[:, None], n_permutations=999)
+    explained = group_test(
+        vectors,
+        groups,
+        covariates=age[:, None],
+        n_permutations=999,
+    )
     assert max(alone.permanova_p or 1, alone.kernel_p or 1) < 0.002
     assert min(explained.permanova_p or 0, explained.kernel_p or 0) > 0.05
     assert (alone.auc or 0) > 0.85 > 0.7 > (explained.auc or 1)
@@ -150,7 +183,13 @@ def test_the_interval_covers_the_effect():
     covered = []
     for draw in range(200):
         vectors = random.normal(size=(80, 2)) + np.outer(np.repeat([0, 1], 40), [1, 0])
-        test = quick(vectors, ["a"] * 40 + ["b"] * 40, draw, n_permutations=1, n_bootstraps=400)
+        test = quick(
+            vectors,
+            ["a"] * 40 + ["b"] * 40,
+            draw,
+            n_permutations=1,
+            n_bootstraps=400,
+        )
         covered.append((test.effect_low or 1) <= truth <= (test.effect_high or 0))
     assert 0.88 < np.mean(covered) < 0.99
 
@@ -175,8 +214,14 @@ def test_matched_pairs_without_a_difference_show_no_effect():
 def test_what_no_permutation_changes_has_a_probability_of_one():
     """If all bodies but one, or both groups, are equal, p = 1; for groups without scatter it is the least, 1 / 200."""
     random = default_rng(11)
-    one = np.outer(np.arange(24) == 3, random.normal(size=5))
-    twice = np.tile(random.normal(size=(12, 3)), (2, 1))
+    one = np.outer(
+        np.arange(24) == 3,
+        random.normal(size=5),
+    )
+    twice = np.tile(
+        random.normal(size=(12, 3)),
+        (2, 1),
+    )
     for vectors in (one, twice):
         test = quick(vectors)
         assert test.permanova_p == test.kernel_p == 1
@@ -191,7 +236,12 @@ def test_small_groups_have_an_interval():
     random = default_rng(6)
     vectors = random.normal(size=(12, 3)) + np.repeat([0, 1], 6)[:, None]
     for seed in range(8):
-        found = quick(vectors, ["a"] * 6 + ["b"] * 6, seed, n_bootstraps=2000)
+        found = quick(
+            vectors,
+            ["a"] * 6 + ["b"] * 6,
+            seed,
+            n_bootstraps=2000,
+        )
         assert found.effect_low is not None
         assert found.effect_high is not None
         assert found.effect_low < found.effect_high < 1
@@ -212,7 +262,11 @@ def test_a_probability_is_that_of_all_arrangements():
         of_kernel.append(within - 2 * kernel[side][:, ~side].mean())
     arranged = np.array([of_means, of_kernel])
     exact = (arranged >= arranged[:, :1] - 1e-12).mean(axis=1)
-    test = quick(values[:, None], ["a"] * 5 + ["b"] * 5, n_permutations=20_000)
+    test = quick(
+        values[:, None],
+        ["a"] * 5 + ["b"] * 5,
+        n_permutations=20_000,
+    )
     expected = pytest.approx(exact, abs=0.01)
     assert [test.permanova_p, test.kernel_p] == expected
 
@@ -241,7 +295,15 @@ def test_what_makes_no_sense_is_refused(given, why):
 
 
 def test_discovery_rates_are_over_what_was_tested():
-    tests = [GroupTest(str(p), {}, permanova_p=p, kernel_p=p) for p in (0.01, 0.04, 0.03)]
+    tests = [
+        GroupTest(
+            str(p),
+            {},
+            permanova_p=p,
+            kernel_p=p,
+        )
+        for p in (0.01, 0.04, 0.03)
+    ]
     refused = GroupTest("no", {}, refused="too few")
     found = with_q_values([tests[0], refused, *tests[1:]])
     assert found[1] is refused
@@ -255,6 +317,10 @@ def test_discovery_rates_are_over_what_was_tested():
 def test_three_groups_are_tested_together():
     random = default_rng(8)
     vectors = random.normal(size=(45, 3)) + np.outer(np.repeat([0, 0, 3], 15), [1, 0, 0])
-    test = quick(vectors, ["a"] * 15 + ["b"] * 15 + ["c"] * 15, n_repeats=1)
+    test = quick(
+        vectors,
+        ["a"] * 15 + ["b"] * 15 + ["c"] * 15,
+        n_repeats=1,
+    )
     assert test.permanova_p == test.kernel_p == 1 / 200
     assert 0.6 < (test.auc or 0) < 1

@@ -88,7 +88,12 @@ def test_height_in_a_ball_lies_along_its_first_axis_however_it_is_turned(ball):
 def test_neither_signs_nor_bases_of_multiplets_matter(made):
     functions = made.interior.eigenfunctions.copy()
     functions[:, [0, 3, 5]] *= -1
-    turn = np.array([[np.cos(1), -np.sin(1)], [np.sin(1), np.cos(1)]])
+    turn = np.array(
+        [
+            [np.cos(1), -np.sin(1)],
+            [np.sin(1), np.cos(1)],
+        ]
+    )
     functions[:, 1:3] = functions[:, 1:3] @ turn
     level = np.array([1.0, 1.5, 1.5, 4.0, 7.0, 9.0])  # an exact multiplet
     same = replace(made, eigenvalues=level)
@@ -136,12 +141,19 @@ def test_classes_are_counted_by_a_loop(made):
 def test_variogram_and_moran_are_counted_by_a_loop(made):
     ct = made.interior.attributes["ct"].astype(np.float64)
     embedded = made.interior.eigenfunctions.astype(np.float64) / np.sqrt(made.eigenvalues)
-    distance = np.linalg.norm(embedded[:, None] - embedded, axis=2)
+    distance = np.linalg.norm(
+        embedded[:, None] - embedded,
+        axis=2,
+    )
     pairs = sorted((distance[i, j], i, j) for i in range(P) for j in range(i))
     n_near = round(0.05 * len(pairs))
     n_middle = round(0.5 * len(pairs))
     numbers = inside_numbers(made, ["ct"])
-    bounds = {"near": (0, n_near), "middle": (n_near, n_middle), "far": (n_middle, len(pairs))}
+    bounds = {
+        "near": (0, n_near),
+        "middle": (n_near, n_middle),
+        "far": (n_middle, len(pairs)),
+    }
     for name, (start, end) in bounds.items():
         half = np.mean([(ct[i] - ct[j]) ** 2 / 2 for _, i, j in pairs[start:end]])
         expected = pytest.approx(half / ct.var(), rel=1e-3)
@@ -159,7 +171,10 @@ def test_variogram_and_moran_are_counted_by_a_loop(made):
 
 def test_two_attributes_are_compared_at_the_same_samples(made):
     ct = made.interior.attributes["ct"].astype(np.float64)
-    same = inside_numbers(with_values(made, twice=2 * ct, minus=-(ct**3)), ["ct", "twice", "minus"])
+    same = inside_numbers(
+        with_values(made, twice=2 * ct, minus=-(ct**3)),
+        ["ct", "twice", "minus"],
+    )
     assert same["ct_and_twice.correlation"] == pytest.approx(1)
     assert same["ct_and_twice.overlap"] == pytest.approx(1)
     assert same["ct_and_twice.information"] == pytest.approx(2, abs=1e-3)  # bits, of four quarters
@@ -171,7 +186,10 @@ def test_two_attributes_are_compared_at_the_same_samples(made):
 
 
 def test_a_constant_has_no_numbers_that_compare_its_values(made):
-    numbers = inside_numbers(with_values(made, ct=np.full(P, 7.0)), ["ct", "pet"])
+    numbers = inside_numbers(
+        with_values(made, ct=np.full(P, 7.0)),
+        ["ct", "pet"],
+    )
     for name, number in numbers.items():
         if name.startswith("pet"):
             assert np.isfinite(number), name
@@ -188,11 +206,17 @@ def test_equal_values_share_the_brightest_tenth():
     found = brightest(np.array([1.0] * 5 + [0] * 15))
     expected = [0.4] * 5 + [0] * 15
     assert_allclose(found, expected)
-    assert_allclose(brightest(np.array([2.0] + [1] * 4 + [0] * 15))[:5], [1] + [0.25] * 4)
+    assert_allclose(
+        brightest(np.array([2.0] + [1] * 4 + [0] * 15))[:5],
+        [1] + [0.25] * 4,
+    )
 
 
 def test_a_missing_attribute_and_one_of_several_values_are_refused(made):
     with pytest.raises(ValueError, match="expected 'mr', got ct, depth, pet"):
         inside_numbers(made, ["mr"])
     with pytest.raises(ValueError, match="got 3"):
-        inside_numbers(with_values(made, colour=np.ones((P, 3))), ["colour"])
+        inside_numbers(
+            with_values(made, colour=np.ones((P, 3))),
+            ["colour"],
+        )

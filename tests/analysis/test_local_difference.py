@@ -10,7 +10,12 @@ from igps.mesh.mesh import Mesh
 
 def ball(radius, unit=None):
     body = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-    return Mesh(body.vertices + np.array([3.0, -2, 1]), body.faces, unit=unit, frame="RAS")
+    return Mesh(
+        body.vertices + np.array([3.0, -2, 1]),
+        body.faces,
+        unit=unit,
+        frame="RAS",
+    )
 
 
 def test_a_larger_ball_lies_outside_by_the_difference_of_the_radii():
@@ -31,7 +36,12 @@ def test_a_bump_is_found_at_its_place_on_a_turned_body():
     weight = np.exp(-np.square(body.vertices - [-20.0, 10.0, 8.0]).sum(axis=1) / 50)
     pushed = body.vertices + 3 * weight[:, None] * body.vertex_normals
     turn = Rotation.from_euler("xyz", [8, -6, 10], degrees=True)
-    other = Mesh(turn.apply(pushed) + np.array([5.0, 5, 5]), body.faces, unit="mm", frame="RAS")
+    other = Mesh(
+        turn.apply(pushed) + np.array([5.0, 5, 5]),
+        body.faces,
+        unit="mm",
+        frame="RAS",
+    )
     found = offsets(other, reference)
     assert np.linalg.norm(body.vertices[found.argmax()] - body.vertices[weight.argmax()]) < 6
     expected = pytest.approx(3 * weight.max(), rel=0.25)
@@ -46,7 +56,12 @@ def test_the_difference_is_the_coefficient_of_the_group_in_a_regression():
     scanner = np.array(["x", "y"])[random.integers(0, 2, 40)]
     rows = random.normal(size=(40, 30)) + age[:, None] + (scanner == "x")[:, None]
     rows[groups == "b", :3] += 6.0
-    found = local_difference(rows, groups, strata=scanner, covariates=age[:, None])
+    found = local_difference(
+        rows,
+        groups,
+        strata=scanner,
+        covariates=age[:, None],
+    )
     columns = np.column_stack([groups == "b", age, scanner == "x", np.ones(40)]).astype(float)
     coefficients = np.linalg.lstsq(columns, rows, rcond=None)[0]
     assert_allclose(found.offset, coefficients[0], rtol=1e-9)

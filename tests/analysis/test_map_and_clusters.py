@@ -14,7 +14,14 @@ from igps.analysis.map import body_map, ends_of_axis
 def blobs(n_each, centres, scatter, seed=0):
     random = default_rng(seed)
     return np.concatenate(
-        [random.normal(centre, scatter, (n_each, len(centre))) for centre in centres]
+        [
+            random.normal(
+                centre,
+                scatter,
+                (n_each, len(centre)),
+            )
+            for centre in centres
+        ]
     )
 
 
@@ -23,7 +30,11 @@ def test_points_of_a_plane_keep_all_their_distances(n):
     points = default_rng(0).normal(size=(n, 2)) * [3, 1]
     distances = cdist(points, points)
     found = body_map(distances)
-    np.testing.assert_allclose(cdist(found.points, found.points), distances, atol=1e-6)
+    np.testing.assert_allclose(
+        cdist(found.points, found.points),
+        distances,
+        atol=1e-6,
+    )
     assert found.stress < 1e-6
     assert found.points[:, 0].var() > found.points[:, 1].var()
     order = default_rng(1).permutation(n)
@@ -98,7 +109,12 @@ def test_words_and_numbers_that_are_none_are_refused():
 @pytest.mark.parametrize("linkage", ["average", "single"])
 def test_clusters_that_were_put_in_are_found_and_stable(linkage):
     large = blobs(20, [[0, 0, 0]], 0.4)
-    points = np.concatenate([large, blobs(12, [[9, 0, 0], [0, 9, 0]], 0.4, seed=1)])
+    points = np.concatenate(
+        [
+            large,
+            blobs(12, [[9, 0, 0], [0, 9, 0]], 0.4, seed=1),
+        ]
+    )
     found = clusters_of(cdist(points, points), linkage=linkage)
     assert found.labels[:20].tolist() == [0] * 20
     expected = [1] * 12 + [2] * 12
@@ -107,7 +123,10 @@ def test_clusters_that_were_put_in_are_found_and_stable(linkage):
     assert min(found.stability) > 0.99
     for number, middle in enumerate(found.medoids):
         own = points[found.labels == number]
-        assert np.allclose(points[middle], own[cdist(own, own).sum(axis=1).argmin()])
+        assert np.allclose(
+            points[middle],
+            own[cdist(own, own).sum(axis=1).argmin()],
+        )
 
 
 def test_bodies_that_are_alike_are_one_cluster():
@@ -129,7 +148,12 @@ def test_clusters_of_one_cloud_are_told_unstable():
 
 def test_a_body_alone_has_no_stability():
     """A cluster of one body has stability NaN; under 70 % of chance clusters of two bodies count as stable."""
-    points = np.concatenate([blobs(20, [[0, 0, 0]], 0.4), [[50.0, 0, 0]]])
+    points = np.concatenate(
+        [
+            blobs(20, [[0, 0, 0]], 0.4),
+            [[50.0, 0, 0]],
+        ]
+    )
     assert np.isnan(clusters_of(cdist(points, points), 2).stability[1])
     pairs = []
     for seed in range(3):
@@ -147,7 +171,12 @@ def test_stability_is_the_mean_largest_jaccard_index_of_halves():
     from scipy.spatial.distance import pdist
 
     points = default_rng(4).normal(size=(30, 2)) * [4, 1]
-    found = clusters_of(cdist(points, points), 3, n_resamples=20, seed=5)
+    found = clusters_of(
+        cdist(points, points),
+        3,
+        n_resamples=20,
+        seed=5,
+    )
     first = [set(np.flatnonzero(found.labels == one).tolist()) for one in range(3)]
 
     random = default_rng(5)
@@ -171,11 +200,25 @@ def test_too_few_bodies_have_no_stability():
 
 def test_the_ends_of_an_axis_and_what_it_holds():
     """Points of a cross: the longer arm has its share of the squared distances, by the variances."""
-    points = np.array([[-3.0, 0], [0, 0], [4, 0], [0, 1], [0, -1]])
-    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    points = np.array(
+        [
+            [-3.0, 0],
+            [0, 0],
+            [4, 0],
+            [0, 1],
+            [0, -1],
+        ]
+    )
+    distances = np.linalg.norm(
+        points[:, None] - points,
+        axis=2,
+    )
     variances = points.var(axis=0)
     for axis, ends in ((1, {0, 2}), (2, {3, 4})):
         found, share = ends_of_axis(distances, axis)
         assert set(found) == ends
-        expected = pytest.approx(variances[axis - 1] / variances.sum(), rel=1e-3)
+        expected = pytest.approx(
+            variances[axis - 1] / variances.sum(),
+            rel=1e-3,
+        )
         assert share == expected

@@ -30,7 +30,10 @@ def test_what_is_usual_is_no_outlier():
 
 
 def test_a_body_alone_in_its_class_is_told_not_to_be_judged():
-    found = outliers(squared_distances(usual()) ** 0.5, ["alone", *LABELS[1:]])
+    found = outliers(
+        squared_distances(usual()) ** 0.5,
+        ["alone", *LABELS[1:]],
+    )
     reason = "shape not assessed: the only body of its class"
     assert [one.label for one in found if one.reason == reason] == ["alone"]
 
@@ -51,7 +54,11 @@ def test_bodies_that_the_scan_cut_are_compared_with_their_like():
     told = {one.body: one.reason for one in apart}
     assert told[5].endswith("the only body of its class cut at LI by the border of the image")
     assert {told[i] for i in range(5)} == {"nothing unusual"}
-    whole_is_small = np.where(np.arange(24) == 9, -np.log(2), volume)
+    whole_is_small = np.where(
+        np.arange(24) == 9,
+        -np.log(2),
+        volume,
+    )
     first = found_of(vectors, measures={"volume": whole_is_small}, cut=sides)[0]
     assert first.body == 9
     assert first.is_outlier is True
@@ -66,18 +73,28 @@ def test_a_body_of_another_shape_comes_first():
     assert first.score > LIMIT
 
 
-@pytest.mark.parametrize(("n", "n_odd"), [(10, 1), (12, 1), (40, 2)])
+@pytest.mark.parametrize(
+    ("n", "n_odd"),
+    [(10, 1), (12, 1), (40, 2)],
+)
 def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n, n_odd):
     """Thirty standard deviations off: an odd body is left out of what is taken to be a tail."""
     random = default_rng(n)
     points = random.normal(size=(n, 4))
     volumes = 0.1 * random.normal(size=n)
     volumes[:n_odd] += 3
-    found = outliers(squared_distances(points) ** 0.5, ["a"] * n, {"volume": volumes})
+    found = outliers(
+        squared_distances(points) ** 0.5,
+        ["a"] * n,
+        {"volume": volumes},
+    )
     assert {one.body for one in found if one.is_outlier} == set(range(n_odd))
 
 
-@pytest.mark.parametrize(("n_subjects", "n_organs"), [(14, 5), (10, 20)])
+@pytest.mark.parametrize(
+    ("n_subjects", "n_organs"),
+    [(14, 5), (10, 20)],
+)
 def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(n_subjects, n_organs):
     """All lengths of one subject are doubled; the bodies of one subject must not be taken for a tail."""
     random = default_rng(n_subjects)
@@ -91,7 +108,12 @@ def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(n_subjects, n_or
     volume[subjects == 3] += np.log(8)
     spacing[subjects == 3] += np.log(2)
     measures = {"volume": volume, "spacing": spacing}
-    found = outliers(squared_distances(points) ** 0.5, labels, measures, subjects=subjects.tolist())
+    found = outliers(
+        squared_distances(points) ** 0.5,
+        labels,
+        measures,
+        subjects=subjects.tolist(),
+    )
     odd = [one.body for one in found if one.is_outlier]
     assert set(np.flatnonzero(subjects == 3)) <= set(odd)
     assert len(odd) <= n_organs + 0.05 * n
@@ -169,7 +191,11 @@ def test_a_repair_that_few_needed_is_a_reason():
 def test_what_is_repaired_in_labels_is_measured_in_their_voxels():
     notes = [["smoothed 3 times"]] * 24
     notes[7] = ["dropped 1 small piece apart of 9 voxels, 0.1% of the label"]
-    stray = np.where(np.arange(24) == 7, 0.001**0.5, 0.0)
+    stray = np.where(
+        np.arange(24) == 7,
+        0.001**0.5,
+        0.0,
+    )
     found = found_of(usual(), measures={"stray": stray}, notes=notes)
     scores = {one.body: one.scores for one in found}
     assert scores[7]["repairs"] == 0 < scores[7]["stray"]
@@ -220,7 +246,10 @@ def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path):
     for name, side in (("fine", 1.0), ("coarse", 2.0)):
         places = (np.indices(3 * [int(40 / side)]) + 0.5) * side - 20
         mask = ((places**2).sum(axis=0) < 14**2).astype(np.uint8)
-        image = nibabel.Nifti1Image(mask, np.diag([side, side, side, 1]))
+        image = nibabel.Nifti1Image(
+            mask,
+            np.diag([side, side, side, 1]),
+        )
         nibabel.save(image, tmp_path / f"{name}.nii.gz")
     files = [tmp_path / "fine.nii.gz", tmp_path / "coarse.nii.gz"]
     dataset = SignatureDataset(files, cache_dir=tmp_path)
@@ -246,7 +275,10 @@ def test_labels_are_measured_in_their_grid(tmp_path):
         "island": island,
     }
     for name, mask in masks.items():
-        image = nibabel.Nifti1Image(mask.astype(np.uint8), np.eye(4))
+        image = nibabel.Nifti1Image(
+            mask.astype(np.uint8),
+            np.eye(4),
+        )
         nibabel.save(image, tmp_path / f"{name}.nii.gz")
     files = [tmp_path / f"{name}.nii.gz" for name in masks]
     dataset = SignatureDataset(files, cache_dir=tmp_path, labels=["a", "b", "a", "c", "d"])
@@ -255,7 +287,15 @@ def test_labels_are_measured_in_their_grid(tmp_path):
         shared = (masks["a"] & masks[name]).sum() / masks["a"].sum()
         assert found["overlap"][0, place] == pytest.approx(shared)
     assert found["overlap"][0, 2] == 0  # of one class, which may be another subject
-    expected = pytest.approx([0, 0, 0, 0, ball(56, 2).sum() / island.sum()])
+    expected = pytest.approx(
+        [
+            0,
+            0,
+            0,
+            0,
+            ball(56, 2).sum() / island.sum(),
+        ]
+    )
     assert found["stray"] ** 2 == expected
     assert found["cut"][2] > 3 * max(found["cut"][[0, 1, 3]])
 
@@ -265,9 +305,16 @@ def test_labels_of_other_subjects_in_the_same_standard_space_do_not_overlap(tmp_
     nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
     x, y, z = np.indices((40, 24, 24))
     for name, at in (("s1", 12), ("s2", 20)):
-        labels = np.where((x - at) ** 2 + (y - 12) ** 2 + (z - 12) ** 2 <= 64, 1, 0)
+        labels = np.where(
+            (x - at) ** 2 + (y - 12) ** 2 + (z - 12) ** 2 <= 64,
+            1,
+            0,
+        )
         labels[at + 9 :, 4:20, 4:20] = 2
-        image = nibabel.Nifti1Image(labels.astype(np.uint8), np.eye(4))
+        image = nibabel.Nifti1Image(
+            labels.astype(np.uint8),
+            np.eye(4),
+        )
         nibabel.save(image, tmp_path / f"{name}.nii.gz")
     bodies = find_bodies(tmp_path, classes="body")
     assert bodies.labels == ("1", "2", "1", "2")

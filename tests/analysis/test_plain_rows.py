@@ -20,7 +20,11 @@ def test_size_alone_tells_small_balls_from_large_ones_and_the_table_says_so(tmp_
     for i in range(8):
         is_large = i % 2
         sides = np.exp(0.05 * generator.normal(size=3)) * (10 if is_large else 1)
-        bodies[f"{i}"] = igps.Mesh(SPHERE.vertices * sides, SPHERE.faces, unit="mm")
+        bodies[f"{i}"] = igps.Mesh(
+            SPHERE.vertices * sides,
+            SPHERE.faces,
+            unit="mm",
+        )
         labels.append("large" if is_large else "small")
     dataset = igps.SignatureDataset(
         bodies, descriptor=Measures(), cache_dir=tmp_path, labels=labels
@@ -37,7 +41,12 @@ def test_size_alone_tells_small_balls_from_large_ones_and_the_table_says_so(tmp_
 
 def test_molecules_have_rows_of_composition_and_length(tmp_path):
     pytest.importorskip("gemmi", reason="the extra [molecules]")
-    names = {"a": ["ALA", "GLY"] * 6, "b": ["ALA", "GLY"] * 6, "c": ["LEU"] * 12, "d": ["LEU"] * 12}
+    names = {
+        "a": ["ALA", "GLY"] * 6,
+        "b": ["ALA", "GLY"] * 6,
+        "c": ["LEU"] * 12,
+        "d": ["LEU"] * 12,
+    }
     for file, residues in names.items():
         lines = []
         for i, residue in enumerate(residues):

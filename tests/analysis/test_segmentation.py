@@ -38,7 +38,10 @@ def test_what_lies_apart_is_counted_whichever_comes_first():
 
 def test_a_cavity_is_the_ball_that_is_missing():
     hollow = ball(20) & ~ball(8)
-    expected = pytest.approx(8**3 / (20**3 - 8**3), rel=0.05)
+    expected = pytest.approx(
+        8**3 / (20**3 - 8**3),
+        rel=0.05,
+    )
     assert cavity_root(hollow) ** 2 == expected
     assert cavity_root(drilled(20, 5)) == 0
 
@@ -47,8 +50,15 @@ def test_a_cavity_is_the_ball_that_is_missing():
 def test_a_tunnel_along_an_axis_is_a_hole_in_the_slices_that_go_around_it(axis):
     """2 π r² √(R² - r²) of the ball, whose tunnel leaves 4/3 π (R² - r²)^(3/2)."""
     x, y, _ = np.moveaxis(offsets(24), axis + 1, 3)
-    mask = np.moveaxis(ball(20) & (x**2 + y**2 > 5**2), 2, axis)
-    expected = pytest.approx(1.5 * 5**2 / (20**2 - 5**2), rel=0.05)
+    mask = np.moveaxis(
+        ball(20) & (x**2 + y**2 > 5**2),
+        2,
+        axis,
+    )
+    expected = pytest.approx(
+        1.5 * 5**2 / (20**2 - 5**2),
+        rel=0.05,
+    )
     assert hole_root(mask) ** 2 == expected
 
 
@@ -72,7 +82,10 @@ def test_a_gap_does_not_depend_on_the_grid_and_not_on_the_unit():
     mask = drilled(20, 5)
     usual = gap_root(mask, ONES)
     assert gap_root(mask, 3 * ONES) == pytest.approx(usual)
-    found = gap_root(np.repeat(mask, 2, axis=2), ONES * [1, 1, 0.5])
+    found = gap_root(
+        np.repeat(mask, 2, axis=2),
+        ONES * [1, 1, 0.5],
+    )
     expected = pytest.approx(usual, rel=0.1)
     assert found == expected
     coarser = gap_root(drilled(60, 15, 64), ONES)

@@ -31,7 +31,10 @@ def test_equal_errors_of_all_points_are_those_of_least_squares():
     points = random.normal(size=(50, 3))
     others = points + 0.01 * random.normal(size=(50, 3))
     found = superposition(points, others)
-    turn, _ = Rotation.align_vectors(points - points.mean(axis=0), others - others.mean(axis=0))
+    turn, _ = Rotation.align_vectors(
+        points - points.mean(axis=0),
+        others - others.mean(axis=0),
+    )
     angle = (Rotation.from_matrix(found.rotation) * turn.inv()).magnitude()
     assert angle < 0.005
     expected = pytest.approx(0.01 * np.sqrt(2.37), rel=0.2)

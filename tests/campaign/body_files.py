@@ -80,12 +80,24 @@ def _damaged(generator, given, packed):
     fault, content = broken_bytes(generator, content)
     if inside:
         content = gzip.compress(content, mtime=0)
-    return replace(given, files={**given.files, name: content}, expected=None, story=fault)
+    return replace(
+        given,
+        files={**given.files, name: content},
+        expected=None,
+        story=fault,
+    )
 
 
 # Label volumes.
 
-AFFINE = np.array([[-0.8, -0.9, 0.1, 30], [-0.6, 1.2, 0, -20], [0, 0, 2.5, 10], [0, 0, 0, 1]])
+AFFINE = np.array(
+    [
+        [-0.8, -0.9, 0.1, 30],
+        [-0.6, 1.2, 0, -20],
+        [0, 0, 2.5, 10],
+        [0, 0, 0, 1],
+    ]
+)
 SHAPE = (24, 22, 14)
 LABELS = {1: "liver", 4: "spleen", 9: "kidney"}
 _VOLUMES = ("nii", "nii.gz", "mgz", "nrrd", "mha", "tif")
@@ -261,12 +273,19 @@ def _pqr(generator):
 
 
 def _scene(generator):
-    boxes = {"shaft": (1.0, 2.0, 3.0), "wheel": (2.0, 2.0, 1.0), "plate": (4.0, 3.0, 0.5)}
+    boxes = {
+        "shaft": (1.0, 2.0, 3.0),
+        "wheel": (2.0, 2.0, 1.0),
+        "plate": (4.0, 3.0, 0.5),
+    }
     suffix = str(generator.choice(["step", "glb"]))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"x.{suffix}"
         if suffix == "step":
-            write_step(path, {name: [((0, 0, 0), side)] for name, side in boxes.items()})
+            write_step(
+                path,
+                {name: [((0, 0, 0), side)] for name, side in boxes.items()},
+            )
         else:
             scene = trimesh.Scene()
             for i, (name, sides) in enumerate(boxes.items()):

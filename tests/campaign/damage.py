@@ -168,7 +168,10 @@ def written(vertices, faces, kind):
         ]
         return ("\n".join(rows) + "\n").encode()
     if kind == "obj":
-        rows = [*(f"v {point}" for point in points), *(f"f {a} {b} {c}" for a, b, c in faces + 1)]
+        rows = [
+            *(f"v {point}" for point in points),
+            *(f"f {a} {b} {c}" for a, b, c in faces + 1),
+        ]
         return ("\n".join(rows) + "\n").encode()
     if kind in ("ply", _TEXT_PLY):
         return _ply(vertices, faces, points, kind == _TEXT_PLY)
@@ -188,7 +191,10 @@ def _ply(vertices, faces, points, text):
             header
             + ("\n".join([*points, *(f"3 {a} {b} {c}" for a, b, c in faces)]) + "\n").encode()
         )
-    corners = np.empty(len(faces), dtype=[("n", "u1"), ("corners", "<i4", 3)])
+    corners = np.empty(
+        len(faces),
+        dtype=[("n", "u1"), ("corners", "<i4", 3)],
+    )
     corners["n"] = 3
     corners["corners"] = faces
     return header + np.asarray(vertices, "<f8").tobytes() + corners.tobytes()
@@ -204,7 +210,12 @@ def _stl(vertices, faces, text):
             rows += ["endloop", "endfacet"]
         return ("\n".join([*rows, "endsolid campaign"]) + "\n").encode()
     records = np.zeros(
-        len(faces), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")]
+        len(faces),
+        dtype=[
+            ("normal", "<f4", 3),
+            ("corners", "<f4", (3, 3)),
+            ("colour", "<u2"),
+        ],
     )
     records["corners"] = corners
     return b"campaign".ljust(80) + struct.pack("<I", len(faces)) + records.tobytes()
@@ -282,7 +293,12 @@ def _bytes(generator, content, suffix):
     if not data:
         return content
     at = int(generator.integers(len(data)))
-    run = int(min(2 ** generator.integers(0, 10), len(data) - at))
+    run = int(
+        min(
+            2 ** generator.integers(0, 10),
+            len(data) - at,
+        )
+    )
     choice = generator.integers(7)
     if choice == 0:
         for i in generator.integers(len(data), size=generator.integers(1, 20)):
@@ -308,7 +324,12 @@ def _tokens(generator, content, suffix):
         if not tokens:
             return content
         chosen = generator.choice(
-            len(tokens), size=min(int(generator.integers(1, 4)), len(tokens)), replace=False
+            len(tokens),
+            size=min(
+                int(generator.integers(1, 4)),
+                len(tokens),
+            ),
+            replace=False,
         )
         for i in sorted(chosen, reverse=True):
             word = str(generator.choice(_WORDS)).encode()
@@ -324,12 +345,29 @@ def _tokens(generator, content, suffix):
 
 def _counts(generator, content, suffix):
     """Change a declared count, or delete or repeat lines."""
-    replacement = generator.choice([-1, 0, 1, 2, 7, 100, 10**6, 2**31 - 1, 2**32 - 1])
+    replacement = generator.choice(
+        [
+            -1,
+            0,
+            1,
+            2,
+            7,
+            100,
+            10**6,
+            2**31 - 1,
+            2**32 - 1,
+        ]
+    )
     wrong = int(replacement) if generator.random() < 0.5 else None
     if suffix == "stl" and not content.startswith(b"solid") and len(content) >= 84:
         (count,) = struct.unpack("<I", content[80:84])
         count = (
-            wrong % 2**32 if wrong is not None else max(count + int(generator.integers(-3, 4)), 0)
+            wrong % 2**32
+            if wrong is not None
+            else max(
+                count + int(generator.integers(-3, 4)),
+                0,
+            )
         )
         return content[:80] + struct.pack("<I", count) + content[84:]
     patterns = {
@@ -379,7 +417,12 @@ def _flip(generator, vertices, faces):
 
 def _hole(generator, vertices, faces):
     return vertices, np.delete(
-        faces, generator.integers(len(faces), size=generator.choice([1, 2, 20])), axis=0
+        faces,
+        generator.integers(
+            len(faces),
+            size=generator.choice([1, 2, 20]),
+        ),
+        axis=0,
     )
 
 
@@ -399,18 +442,37 @@ def _glue(generator, vertices, faces):
 
 def _fin(generator, vertices, faces):
     return vertices, np.concatenate(
-        [faces, generator.integers(len(vertices), size=(generator.choice([1, 3]), 3))]
+        [
+            faces,
+            generator.integers(len(vertices), size=(generator.choice([1, 3]), 3)),
+        ]
     )
 
 
 def _index(generator, vertices, faces):
-    wrong = int(generator.choice([-1, len(vertices), 10**6, 2**31 - 1, -(2**31), int(faces.max())]))
+    wrong = int(
+        generator.choice(
+            [
+                -1,
+                len(vertices),
+                10**6,
+                2**31 - 1,
+                -(2**31),
+                int(faces.max()),
+            ]
+        )
+    )
     faces[generator.integers(len(faces)), generator.integers(3)] = wrong
     return vertices, faces
 
 
 def _strays(generator, vertices, faces):
-    return np.concatenate([vertices, generator.normal(size=(generator.choice([1, 5]), 3))]), faces
+    return np.concatenate(
+        [
+            vertices,
+            generator.normal(size=(generator.choice([1, 5]), 3)),
+        ]
+    ), faces
 
 
 def _twins(generator, vertices, faces):
@@ -437,7 +499,11 @@ def _order(generator, vertices, faces):
     order = generator.permutation(len(vertices))
     position = np.argsort(order)
     is_valid = (faces >= 0) & (faces < len(vertices))
-    return vertices[order], np.where(is_valid, position[np.where(is_valid, faces, 0)], faces)
+    return vertices[order], np.where(
+        is_valid,
+        position[np.where(is_valid, faces, 0)],
+        faces,
+    )
 
 
 def _not_finite(generator, vertices, faces):
@@ -448,7 +514,12 @@ def _not_finite(generator, vertices, faces):
 
 
 def _spike(generator, vertices, faces):
-    exponent = generator.choice([generator.uniform(0, 3), generator.uniform(-300, 300)])
+    exponent = generator.choice(
+        [
+            generator.uniform(0, 3),
+            generator.uniform(-300, 300),
+        ]
+    )
     vertices[generator.integers(len(vertices)), generator.integers(3)] = (
         generator.choice([-1, 1]) * 10**exponent
     )

@@ -66,7 +66,11 @@ def table(rows):
             + " |"
         )
 
-    text = [formatted(header), formatted(["-" * width for width in widths]), *map(formatted, lines)]
+    text = [
+        formatted(header),
+        formatted(["-" * width for width in widths]),
+        *map(formatted, lines),
+    ]
     for row in rows:
         text += [f"MISSED {row.part}, {row.what}: {miss}" for miss in row.missed]
         text += [f"note   {row.part}, {row.what}: {note}" for note in row.notes]

@@ -214,7 +214,11 @@ def _motion(describer, data):
     )
     mesh = bodies()[number]
     faces = mesh.faces if np.linalg.det(turn) > 0 else mesh.faces[:, ::-1]
-    moved = replace(mesh, vertices=mesh.vertices @ turn.T + generator.normal(size=3), faces=faces)
+    moved = replace(
+        mesh,
+        vertices=mesh.vertices @ turn.T + generator.normal(size=3),
+        faces=faces,
+    )
     return _moved_mesh(describer, number, moved)
 
 
@@ -225,7 +229,11 @@ def _turned_grid(describer, data):
     signs = np.array(data.draw(st.tuples(*[st.sampled_from([-1.0, 1.0])] * 3)))
     signs[0] *= np.linalg.det(np.eye(3)[order] * signs)
     mesh = bodies()[number]
-    return _moved_mesh(describer, number, replace(mesh, vertices=mesh.vertices[:, order] * signs))
+    return _moved_mesh(
+        describer,
+        number,
+        replace(mesh, vertices=mesh.vertices[:, order] * signs),
+    )
 
 
 def _scale(describer, data):
@@ -234,7 +242,10 @@ def _scale(describer, data):
     return _moved_mesh(
         describer,
         number,
-        replace(mesh, vertices=mesh.vertices * 10 ** data.draw(st.floats(-12, 12))),
+        replace(
+            mesh,
+            vertices=mesh.vertices * 10 ** data.draw(st.floats(-12, 12)),
+        ),
     )
 
 
@@ -255,7 +266,11 @@ def _many_vertices(describer, data):
 
 def _renumbered(mesh, seed):
     order = default_rng(seed).permutation(len(mesh.vertices))
-    return replace(mesh, vertices=mesh.vertices[order], faces=np.argsort(order)[mesh.faces])
+    return replace(
+        mesh,
+        vertices=mesh.vertices[order],
+        faces=np.argsort(order)[mesh.faces],
+    )
 
 
 def _faces(describer, data):
@@ -264,7 +279,11 @@ def _faces(describer, data):
     generator = default_rng(data.draw(_seeds))
     faces = mesh.faces[generator.permutation(len(mesh.faces))]
     start = generator.integers(3, size=(len(faces), 1))
-    turned = np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)
+    turned = np.take_along_axis(
+        faces,
+        (start + np.arange(3)) % 3,
+        axis=1,
+    )
     return _moved_mesh(describer, number, replace(mesh, faces=turned))
 
 
@@ -333,7 +352,10 @@ def _padding(describer, data):
             return np.concatenate([values, values])
 
         attributes = {name: twice(values) for name, values in samples.attributes.items()}
-        functions = np.concatenate([samples.eigenfunctions, samples.eigenfunctions[:, -5:]], axis=1)
+        functions = np.concatenate(
+            [samples.eigenfunctions, samples.eigenfunctions[:, -5:]],
+            axis=1,
+        )
         return Samples(twice(samples.points), twice(functions), attributes)
 
     larger = replace(
@@ -345,8 +367,16 @@ def _padding(describer, data):
         surface=longer(repeated.surface),
     )
     place = data.draw(st.integers(0, 1))
-    pair = [(describer.signatures[number], bodies()[number]), (larger, bodies()[other])]
-    batch = collate(*zip(*(pair if place == 0 else pair[::-1]), strict=True))
+    pair = [
+        (describer.signatures[number], bodies()[number]),
+        (larger, bodies()[other]),
+    ]
+    batch = collate(
+        *zip(
+            *(pair if place == 0 else pair[::-1]),
+            strict=True,
+        )
+    )
     with torch.inference_mode():
         after = {name: module(batch)[[place]] for name, module in describer.descriptors.items()}
     return describer.unchanged[number], after
@@ -354,7 +384,10 @@ def _padding(describer, data):
 
 def _batch_size(describer, data):
     numbers = data.draw(st.lists(_numbers, min_size=2, max_size=3))
-    batch = collate([describer.signatures[i] for i in numbers], [bodies()[i] for i in numbers])
+    batch = collate(
+        [describer.signatures[i] for i in numbers],
+        [bodies()[i] for i in numbers],
+    )
     with torch.inference_mode():
         after = {name: module(batch)[[-1]] for name, module in describer.descriptors.items()}
     return describer.unchanged[numbers[-1]], after
@@ -403,7 +436,10 @@ def _row(describer, prop, changes, n_examples):
             tried += 1
             movements = describer.movements(*change(describer, data))
             for name, movement in movements.items():
-                largest[name] = max(largest[name], movement if np.isfinite(movement) else np.inf)
+                largest[name] = max(
+                    largest[name],
+                    movement if np.isfinite(movement) else np.inf,
+                )
             # Hypothesis searches for the largest movement relative to its bound.
             shares = [
                 min(movement, 1e6) / bound(prop, name).percent
@@ -431,7 +467,10 @@ def _row(describer, prop, changes, n_examples):
                 notes.append(f"{sentence}: {limit.known}")
             else:
                 missed.append(sentence)
-    worst = max(largest, key=lambda name: largest[name] / bound(prop, name).percent)
+    worst = max(
+        largest,
+        key=lambda name: largest[name] / bound(prop, name).percent,
+    )
     return Row(
         "properties",
         prop,

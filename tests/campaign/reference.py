@@ -76,7 +76,11 @@ def confirm(mesh, signature, written, config, suffix):
         ),
         "eigenvalues or eigenfunctions are not",
     )
-    check("ascending", bool((np.diff(values) >= 0).all() and values[0] > 0), f"{values}")
+    check(
+        "ascending",
+        bool((np.diff(values) >= 0).all() and values[0] > 0),
+        f"{values}",
+    )
     well_shaped = bool(_thinness(vertices, faces).min() > _MIN_ASPECT)
     functions = None
     if well_shaped:
@@ -133,7 +137,13 @@ def confirm(mesh, signature, written, config, suffix):
 
 def _check_motion(mesh, signature, histograms, config, check):
     """Check that a quarter turn, which maps the grid to itself, and a shift leave the numbers as they are."""
-    turn = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    turn = np.array(
+        [
+            [0.0, -1.0, 0.0],
+            [0.0, 0.0, -1.0],
+            [1.0, 0.0, 0.0],
+        ]
+    )
     centred = mesh.vertices - _centre(mesh)
     shift = np.ptp(mesh.vertices, axis=0).max() * np.array([0.37, -0.61, 0.23])
     moved_mesh = replace(mesh, vertices=centred @ turn.T + shift)
@@ -203,7 +213,11 @@ def _same_arrays(mesh, written, single):
 def _is_surface(vertices, faces, allow_open):
     """Whether a surface is closed (unless it may be open), connected and oriented, without edges of three faces."""
     surface = trimesh.Trimesh(vertices, faces, process=False)
-    edges, count = np.unique(np.sort(surface.edges, axis=1), axis=0, return_counts=True)
+    edges, count = np.unique(
+        np.sort(surface.edges, axis=1),
+        axis=0,
+        return_counts=True,
+    )
     n_components = (
         trimesh.graph.connected_component_labels(edges, node_count=len(vertices)).max() + 1
     )
@@ -259,7 +273,10 @@ def mean_values(vertices, faces, points, functions):
         offset = vertices - point
         distance = norm(offset, axis=1)
         u = (offset / distance[:, None])[faces]
-        sides = norm(np.roll(u, -1, axis=1) - np.roll(u, -2, axis=1), axis=2)
+        sides = norm(
+            np.roll(u, -1, axis=1) - np.roll(u, -2, axis=1),
+            axis=2,
+        )
         angles = 2 * np.arcsin(np.clip(sides / 2, 0, 1))
         half = angles.sum(axis=1, keepdims=True) / 2
         sines = np.sin(angles)

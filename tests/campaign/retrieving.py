@@ -33,7 +33,10 @@ def write_shapes(folder):
         for number in range(SHAPES_PER_CLASS):
             x, y, z = np.asarray(mesh.vertices).T
             a, b, c = generator.uniform(0.05, 0.3, 3)
-            vertices = np.stack([x * (1 + a), y + b * x * x, z + c * np.sin(2 * x)], axis=1)
+            vertices = np.stack(
+                [x * (1 + a), y + b * x * x, z + c * np.sin(2 * x)],
+                axis=1,
+            )
             (folder / label / f"{number}.off").write_text(
                 off_text(vertices, np.asarray(mesh.faces))
             )
@@ -62,7 +65,11 @@ def arguments(shapes, cache, out, n_workers):
 
 def environment(fault=""):
     """Environment of a command that can import the descriptor, with a fault of the machine if one is named."""
-    paths = [str(HERE), *([str(HERE / "shims")] if fault else []), *sys.path]
+    paths = [
+        str(HERE),
+        *([str(HERE / "shims")] if fault else []),
+        *sys.path,
+    ]
     path = os.pathsep.join(dict.fromkeys(path for path in paths if path))
     return {**os.environ, "PYTHONPATH": path, "IGPS_CAMPAIGN_FAULT": fault, "OMP_NUM_THREADS": "1"}
 

@@ -127,7 +127,10 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(name, tmp_path):
             ) ** 2 <= 1
             word = ("ann", "bob", "cid", "dan", "eve")[i]  # before and after, of the same subjects
             path = folder / f"{name.format(group=group, i=i, word=word)}.nii.gz"
-            nibabel.save(nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)), path)
+            nibabel.save(
+                nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)),
+                path,
+            )
     words = ["--test_size", "--out", tmp_path / "found"]
     igps(tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
     _, size = json.loads((tmp_path / "found" / "groups.json").read_text())
@@ -141,7 +144,10 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(name, tmp_path):
 def test_volumes_are_compared_in_one_unit(tmp_path, capsys):
     """Half of the eggs of each group are in metres."""
     root = tmp_path / "eggs"
-    heights = {"low": (1.0, 1.02, 1.04, 1.06, 1.08), "high": (2.0, 2.02, 2.04, 2.06, 2.08)}
+    heights = {
+        "low": (1.0, 1.02, 1.04, 1.06, 1.08),
+        "high": (2.0, 2.02, 2.04, 2.06, 2.08),
+    }
     for label, of_each in heights.items():
         for i, height in enumerate(of_each):
             write_egg(path := root / label / f"{i}.off", height, subdivisions=2)
@@ -244,7 +250,10 @@ def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(masks, tmp_path)
     place = np.indices((40, 14, 14)) - 6.5
     for subject in range(10):
         labels = np.zeros((40, 14, 14), dtype=np.uint8)
-        for label, (x, *half) in enumerate([(0, 4, 4, 4), (12, 6, 3, 3), (26, 6, 5, 3)], start=1):
+        for label, (x, *half) in enumerate(
+            [(0, 4, 4, 4), (12, 6, 3, 3), (26, 6, 5, 3)],
+            start=1,
+        ):
             a, b, c = half * random.normal(1, 0.05, 3)
             labels[((place[0] - x) / a) ** 2 + (place[1] / b) ** 2 + (place[2] / c) ** 2 < 1] = (
                 label
@@ -333,7 +342,13 @@ def test_explain_and_groups_paint_where_an_organ_differs(tmp_path, capsys):
         sizes = random.uniform(0.95, 1.05, 3) * [10.0, 8.0, 9.0]
         centre = np.array([0.0, -9.0, -10.0])
         organ = (((world - centre) / sizes) ** 2).sum(axis=-1) < 1
-        knob = np.linalg.norm(world - centre - [-sizes[0], 0, 0], axis=-1) < 5.5
+        knob = (
+            np.linalg.norm(
+                world - centre - [-sizes[0], 0, 0],
+                axis=-1,
+            )
+            < 5.5
+        )
         other = (((world - [0.0, -9.0, 14.0]) / sizes) ** 2).sum(axis=-1) < 1
         labels = (organ | (knob & (i < 6))).astype(np.uint8) + 2 * other.astype(np.uint8)
         affine = np.diag([1.5, 1.5, 1.5, 1.0])
@@ -448,9 +463,10 @@ def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
     rows = table(tmp_path / "clusters.csv")
     dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
     found = body_map(chi_square(*2 * [describe(dataset, small_interior())]).numpy())
-    assert np.array([[row["x"], row["y"]] for row in rows], dtype=float) == pytest.approx(
-        found.points, abs=1e-5
-    )
+    assert np.array(
+        [[row["x"], row["y"]] for row in rows],
+        dtype=float,
+    ) == pytest.approx(found.points, abs=1e-5)
     assert f"stress {found.stress:.2f}" in capsys.readouterr().out
     first = {
         "class": "short",
@@ -534,7 +550,14 @@ def test_what_labels_do_not_tell_is_refused_before_anything_is_computed(
 ):
     cache = ["--cache_dir", tmp_path / "cache"]
     where = next(i for i, word in enumerate(command) if word.startswith("--"))
-    words = [*command[:where], root, *command[where:], *OWN, *cache, *SMALL]
+    words = [
+        *command[:where],
+        root,
+        *command[where:],
+        *OWN,
+        *cache,
+        *SMALL,
+    ]
     with pytest.raises(SystemExit, match="1"):
         run(*words)
     assert message in capsys.readouterr().err

@@ -786,5 +786,10 @@ def test_completion_knows_commands_and_options(shell, tmp_path, capsys):
             + "$(complete -p igps | sed 's/.*-F \\([^ ]*\\).*/\\1/') "
             + f"igps {words[-1]} {words[-2]}; echo ${{COMPREPLY[@]}}"
         )
-        done = subprocess.run([program, "-c", ask], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [program, "-c", ask],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
         assert done.stdout.split() == expected, line

@@ -25,7 +25,10 @@ def root(tmp_path_factory):
         ] = 1
         labels[14:20, 5:12, 5 : 14 + i] = 2
         labels[22, 2:9, 2] = 3 * (i == 2)
-        nibabel.save(nibabel.Nifti1Image(labels, np.diag([2.0, 2, 2, 1])), folder / f"{i}.nii.gz")
+        nibabel.save(
+            nibabel.Nifti1Image(labels, np.diag([2.0, 2, 2, 1])),
+            folder / f"{i}.nii.gz",
+        )
         (folder / f"{i}.csv").write_text("label,name\n1,liver\n2,spleen\n3,heart\n")
     (folder / "labels.csv").write_text("file,age,body,label\n1.nii.gz,40,,well\n2.nii.gz,,,ill\n")
     return folder

@@ -90,7 +90,10 @@ def test_rows_are_cached_and_printed_as_json(root, monkeypatch, capsys):
 
 def test_one_image_of_two_subjects_and_another_unit_are_remarked(root, tmp_path, capsys):
     for i in range(4):
-        write(tmp_path / f"s{i}.nii.gz", (radius(1 + i / 50) < 1).astype(np.uint8))
+        write(
+            tmp_path / f"s{i}.nii.gz",
+            (radius(1 + i / 50) < 1).astype(np.uint8),
+        )
         shutil.copy(root / "ct" / "rim.nii.gz", tmp_path / f"s{i}_ct.nii.gz")
     write(tmp_path / "s3_ct.nii.gz", (radius(1.0) / 1000).astype(np.float32))
     igps(root, "inside", tmp_path, "--attribute", "ct={stem}_ct.nii.gz")

@@ -73,7 +73,10 @@ def test_retrieve_with_its_page(
     assert dataset is not None
     found = surfaces_of(dataset, n_workers=1)
     assert (out / "report.html").read_text("utf-8") == render_page(read_results(out), found)
-    assert not re.search(re.escape(str(tmp_path)), (out / "report.html").read_text("utf-8"))
+    assert not re.search(
+        re.escape(str(tmp_path)),
+        (out / "report.html").read_text("utf-8"),
+    )
 
 
 def test_a_page_afterwards_wherever_the_meshes_are(

@@ -47,7 +47,10 @@ def linear(points):
 
 def image():
     """The linear function at the centres of all voxels."""
-    index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
+    index = np.stack(
+        np.meshgrid(*map(np.arange, SHAPE), indexing="ij"),
+        axis=-1,
+    )
     return linear(index @ AFFINE[:3, :3].T + AFFINE[:3, 3])
 
 
@@ -89,7 +92,10 @@ def test_an_image_gives_a_linear_function_wherever_it_lies(body, suffix, write):
 @pytest.mark.parametrize("suffix", [".dx", ".mrc"])
 def test_a_grid_gives_a_linear_function(body, suffix):
     grids = pytest.importorskip("gridData")
-    index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
+    index = np.stack(
+        np.meshgrid(*map(np.arange, SHAPE), indexing="ij"),
+        axis=-1,
+    )
     delta = np.array([0.5, 0.25, 0.5])
     origin = np.array([-5.0, -3.0, -4.0])
     grid = grids.Grid(linear(index * delta + origin), origin=origin, delta=delta)
@@ -100,7 +106,10 @@ def test_a_grid_gives_a_linear_function(body, suffix):
 
 def test_axes_of_a_map_in_another_order_are_put_right(body):
     mrcfile = pytest.importorskip("mrcfile")
-    index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
+    index = np.stack(
+        np.meshgrid(*map(np.arange, SHAPE), indexing="ij"),
+        axis=-1,
+    )
     delta = np.array([0.5, 0.25, 0.5])
     start = np.array([-10, -12, -8])
     values = linear((index + start) * delta).astype(np.float32)
@@ -120,7 +129,10 @@ def test_axes_of_a_map_in_another_order_are_put_right(body):
 def test_a_map_is_placed_by_its_origin_or_else_by_its_start(told, body):
     """If both are given, only the origin counts, as in Chimera, EMAN and IMP. The oracle is a linear function."""
     mrcfile = pytest.importorskip("mrcfile")
-    index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
+    index = np.stack(
+        np.meshgrid(*map(np.arange, SHAPE), indexing="ij"),
+        axis=-1,
+    )
     start = np.array([-10, -12, -8])
     with mrcfile.new(body.path.with_name("a.mrc")) as file:
         file.set_data(np.ascontiguousarray(linear((index + start) * 0.5).astype(np.float32).T))
@@ -231,7 +243,10 @@ def test_values_at_vertices_give_the_same_linear_function_inside(body, name, wri
 
 
 @pytest.mark.filterwarnings("ignore:Unknown extension code")
-@pytest.mark.parametrize("head", [[2, 0, 20], [2, 1, 20], None])
+@pytest.mark.parametrize(
+    "head",
+    [[2, 0, 20], [2, 1, 20], None],
+)
 def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(tmp_path, head):
     """Its origin is in the middle of the image, and its axes are not the world's, unless the file says otherwise."""
     nibabel = pytest.importorskip("nibabel")
@@ -239,7 +254,13 @@ def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(tmp_path, he
     nibabel.save(made, tmp_path / "t1.mgz")
     ball = icosphere(subdivisions=1)
     mdc = made.header["Mdc"]  # rows are the directions of the axes of voxels
-    keys = dict(zip(("xras", "yras", "zras", "cras"), [*mdc, made.header["Pxyz_c"]], strict=True))
+    keys = dict(
+        zip(
+            ("xras", "yras", "zras", "cras"),
+            [*mdc, made.header["Pxyz_c"]],
+            strict=True,
+        )
+    )
     told = {
         "head": head,
         "valid": "1  # volume info valid",
@@ -271,7 +292,11 @@ def test_values_at_vertices_survive_mending(tmp_path):
 def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(tmp_path):
     """Two balls in one file, whose values jump between them; then values of the second ball alone."""
     ball = icosphere(subdivisions=3)
-    away = trimesh.Trimesh(ball.vertices + np.array([5, 0, 0]), ball.faces, process=False)
+    away = trimesh.Trimesh(
+        ball.vertices + np.array([5, 0, 0]),
+        ball.faces,
+        process=False,
+    )
     both = trimesh.util.concatenate([ball, away])
     values = np.concatenate([linear(ball.vertices), linear(ball.vertices) + 100])
     write_ply(tmp_path / "both.ply", both, values)
@@ -288,7 +313,10 @@ def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(tmp_pat
         ("b", "b", 5, 7),
     ):
         source = VertexAttribute(f"{name}.ply#height", reading=LoadOptions(bodies="objects"))
-        found = source(BodyRef(tmp_path / "two.obj", part), INSIDE + np.array([shift, 0, 0]))
+        found = source(
+            BodyRef(tmp_path / "two.obj", part),
+            INSIDE + np.array([shift, 0, 0]),
+        )
         assert_allclose(found, linear(INSIDE) + added, atol=1e-3)
     few = icosphere(subdivisions=1)
     write_ply(tmp_path / "few.ply", few, linear(few.vertices))
@@ -546,13 +574,27 @@ def test_an_image_is_added_to_a_cached_collection_and_again_when_it_changes(tmp_
 def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path):
     pytest.importorskip("gemmi")
     line = "ATOM  {:5d} {:<4} {:3} {}{:4d}    {:8.3f}{:8.3f}{:8.3f}  1.00 {:5.2f}           {}\n"
-    rows = [("N", 0.0, 1.4), ("CA", 0.0, 0.0), ("C", 1.5, 0.0), ("O", 2.0, 1.0)]
+    rows = [
+        ("N", 0.0, 1.4),
+        ("CA", 0.0, 0.0),
+        ("C", 1.5, 0.0),
+        ("O", 2.0, 1.0),
+    ]
     text = ""
     for chain, name, z in (("A", "LYS", 0.0), ("B", "ASP", 30.0)):
         for i in range(6):
             for j, (atom, x, y) in enumerate(rows):
                 place = (x + 3.8 * i, y, z)
-                text += line.format(j, f" {atom}", name, chain, i, *place, 10.0, atom[0])
+                text += line.format(
+                    j,
+                    f" {atom}",
+                    name,
+                    chain,
+                    i,
+                    *place,
+                    10.0,
+                    atom[0],
+                )
     for path, content in (
         (tmp_path / "a.pdb", text.encode()),
         (tmp_path / "b.pdb.gz", gzip.compress(text.encode())),
@@ -584,9 +626,15 @@ def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path):
 def test_an_image_that_has_changed_is_read_again_though_its_time_is_the_same(name, tmp_path):
     itk = pytest.importorskip("SimpleITK")
     for value in (1.0, 2.0):
-        itk.WriteImage(itk.GetImageFromArray(np.full((9, 9, 9), value)), str(tmp_path / name))
+        itk.WriteImage(
+            itk.GetImageFromArray(np.full((9, 9, 9), value)),
+            str(tmp_path / name),
+        )
         os.utime(tmp_path / name, (1e9, 1e9))
-        found = attribute_source(name)(BodyRef(tmp_path / "egg.off"), np.array([[-2.0, -3.0, 4.0]]))
+        found = attribute_source(name)(
+            BodyRef(tmp_path / "egg.off"),
+            np.array([[-2.0, -3.0, 4.0]]),
+        )
         assert_allclose(found, value)
 
 

@@ -107,7 +107,11 @@ def test_labels_and_names(signatures):
 def test_meshes_go_with_their_bodies(signatures):
     box = trimesh.creation.box()
     meshes = [
-        Mesh(np.asarray(box.vertices) * s, np.asarray(box.faces), name=str(s))
+        Mesh(
+            np.asarray(box.vertices) * s,
+            np.asarray(box.faces),
+            name=str(s),
+        )
         for s in (1.0, 2.0, 3.0)
     ]
     batch = collate(signatures, meshes)
@@ -126,9 +130,21 @@ def test_points_are_centred_before_they_lose_digits():
     generator = np.random.default_rng(1)
     near = samples(generator, 20, 2)
     far = replace(near, points=near.points + 1e6)
-    whole = Signature(np.array([1.0, 2.0]), near, near, 1.0, 1.0, SignatureConfig(n_eigenpairs=2))
+    whole = Signature(
+        np.array([1.0, 2.0]),
+        near,
+        near,
+        1.0,
+        1.0,
+        SignatureConfig(n_eigenpairs=2),
+    )
     batch = collate([whole, replace(whole, interior=far, surface=far)])
-    assert_close(batch.interior.points[0], batch.interior.points[1], atol=1e-6, rtol=0)
+    assert_close(
+        batch.interior.points[0],
+        batch.interior.points[1],
+        atol=1e-6,
+        rtol=0,
+    )
     found = batch.interior.points.mean(dim=1)
     np.testing.assert_allclose(found, 0, atol=1e-6)
 
@@ -159,7 +175,10 @@ def test_subset_takes_real_samples_each_once(signatures, seed):
         for name, values in some.attributes.items():
             places = batch.points[i].tolist()
             order = [places.index(point) for point in some.points[i, some.mask[i]].tolist()]
-            assert torch.equal(values[i, some.mask[i]], batch.attributes[name][i, order])
+            assert torch.equal(
+                values[i, some.mask[i]],
+                batch.attributes[name][i, order],
+            )
     assert (some.eigenfunctions[~some.mask] == 0).all()
 
 
@@ -260,7 +279,10 @@ def test_batches_that_do_not_fit_are_not_joined(signatures):
         SignatureBatch.concatenate([with_mesh, without])
     with pytest.raises(ValueError, match="batches: expected at least one"):
         SignatureBatch.concatenate([])
-    bare = replace(signatures[0], interior=replace(signatures[0].interior, attributes={}))
+    bare = replace(
+        signatures[0],
+        interior=replace(signatures[0].interior, attributes={}),
+    )
     with pytest.raises(ValueError, match="attributes: all bodies must carry the same"):
         SignatureBatch.concatenate([collate([bare]), without])
 
@@ -287,7 +309,10 @@ def test_workers_give_the_batches_of_this_process(signatures):
     for one, other in ((batch.interior, expected.interior), (batch.surface, expected.surface)):
         assert torch.equal(one.eigenfunctions, other.eigenfunctions)
         assert torch.equal(one.mask, other.mask)
-    alike = [signatures[0], replace(signatures[0], interior=signatures[0].surface)]
+    alike = [
+        signatures[0],
+        replace(signatures[0], interior=signatures[0].surface),
+    ]
     (batch,) = DataLoader(Several(alike), batch_size=2, num_workers=1, collate_fn=collate)
     assert equal(batch, collate(alike))
     assert torch.equal(batch.interior.eigenfunctions, collate(alike).interior.eigenfunctions)
@@ -322,7 +347,11 @@ def numbered(items):
 @pytest.mark.parametrize("make", [thinned, numbered])
 def test_a_worker_hands_over_what_its_user_makes_of_a_batch(signatures, make):
     loader = DataLoader(Several(signatures), batch_size=2, num_workers=1, collate_fn=make)
-    for batch, right in zip(loader, map(make, (signatures[:2], signatures[2:])), strict=True):
+    for batch, right in zip(
+        loader,
+        map(make, (signatures[:2], signatures[2:])),
+        strict=True,
+    ):
         assert equal(batch, right)
         assert batch.labels.tolist() == right.labels.tolist()
         assert batch.area.tolist() == right.area.tolist()
@@ -354,7 +383,10 @@ def test_batches_go_to_a_device_and_bodies_come_back(signatures):
         batch[torch.tensor([2, 0], device="cuda")].to("cpu"),
         collate([signatures[2], signatures[0]]),
     )
-    assert equal(SignatureBatch.concatenate([batch[:1], batch[1:]]).to("cpu"), collate(signatures))
+    assert equal(
+        SignatureBatch.concatenate([batch[:1], batch[1:]]).to("cpu"),
+        collate(signatures),
+    )
     assert batch.interior.attributes["depth"].is_cuda
     assert batch.labels.is_cuda
     for body, signature in zip(batch.bodies(), signatures, strict=True):
@@ -375,5 +407,8 @@ def test_a_batch_is_a_container_of_tensors_for_pytorch():
     doubled = torch.utils._pytree.tree_map(lambda tensor: tensor[1:], batch)
     assert isinstance(doubled, SignatureBatch)
     assert torch.equal(doubled.interior.points, batch.interior.points[1:])
-    assert torch.equal(doubled.surface.attributes["depth"], batch.surface.attributes["depth"][1:])
+    assert torch.equal(
+        doubled.surface.attributes["depth"],
+        batch.surface.attributes["depth"][1:],
+    )
     assert doubled.ids == batch.ids

@@ -21,7 +21,11 @@ def signature():
 
     def samples(n):
         values = generator.random((n, 3)).astype(np.float32)
-        return Samples(generator.random((n, 3)), values, {"depth": values[:, 0].copy()})
+        return Samples(
+            generator.random((n, 3)),
+            values,
+            {"depth": values[:, 0].copy()},
+        )
 
     return Signature(
         np.array([1.0, 2.0, 3.5]),
@@ -73,7 +77,12 @@ def replace_by_foreign(path):
 
 
 def belongs_to_another_key(path):
-    path.write_bytes(path.read_bytes().replace(KEY.encode(), KEY[::-1].encode()))
+    path.write_bytes(
+        path.read_bytes().replace(
+            KEY.encode(),
+            KEY[::-1].encode(),
+        )
+    )
 
 
 @pytest.mark.parametrize(

@@ -146,7 +146,10 @@ def test_key_covers_every_parameter(root, tmp_path):
         "least_vertices": 200,
     }
     assert {field.name for field in fields(CONFIG)} == set(changes)
-    configs = [CONFIG, *(replace(CONFIG, **{name: new}) for name, new in changes.items())]
+    configs = [
+        CONFIG,
+        *(replace(CONFIG, **{name: new}) for name, new in changes.items()),
+    ]
     keys = {SignatureDataset(root, config, tmp_path / "cache").key(0) for config in configs}
     assert len(keys) == 1 + len(changes)
 
@@ -258,7 +261,12 @@ def test_batch_has_the_meshes_on_demand(dataset):
     assert isinstance(batch, SignatureBatch)
     assert batch.ids == ("egg/2.off", "ball/2.off")
     assert batch.labels.tolist() == [1, 0]
-    for mesh, body, i in zip(batch.meshes or (), batch.bodies(), (3, 1), strict=True):
+    for mesh, body, i in zip(
+        batch.meshes or (),
+        batch.bodies(),
+        (3, 1),
+        strict=True,
+    ):
         assert_array_equal(mesh.vertices, dataset.mesh(i).vertices)
         assert mesh.area == pytest.approx(body.area)
 
@@ -362,8 +370,14 @@ def test_in_memory_nothing_is_read_any_more(dataset, root, tmp_path):
     kept = dataset.to_memory()
     shutil.rmtree(root)
     shutil.rmtree(tmp_path / "cache")
-    assert torch.equal(kept.batch(range(4)).interior.eigenfunctions, before.interior.eigenfunctions)
-    assert torch.equal(kept[[3, 1]].batch([0, 1]).labels, before.labels[[3, 1]])
+    assert torch.equal(
+        kept.batch(range(4)).interior.eigenfunctions,
+        before.interior.eigenfunctions,
+    )
+    assert torch.equal(
+        kept[[3, 1]].batch([0, 1]).labels,
+        before.labels[[3, 1]],
+    )
     assert kept.subset([2])[0].id == "egg/1.off"
     assert len(pickle.dumps(kept.subset([2]))) < len(pickle.dumps(kept)) / 2
     assert kept.precompute() == []
@@ -432,7 +446,13 @@ def test_a_pre_transform_is_kept_under_a_key_of_its_own(dataset, counted, root):
     assert len(applied) == 5
     keys = first.cached_keys()
     # Of the last one is, and None
-    found = len({*keys, *dataset.cached_keys(), *changed(1).cached_keys()})
+    found = len(
+        {
+            *keys,
+            *dataset.cached_keys(),
+            *changed(1).cached_keys(),
+        }
+    )
     assert found == 10
     assert changed(0).cached_keys() == keys
     found = [first.key(i) for i in range(len(first))]
@@ -459,7 +479,14 @@ class Image:
     def __call__(self, body, points):
         self.read += 1
         values = self.slope * points[:, 2] + 100 * (body.path.parent.name == "egg")
-        return values if self.n_channels is None else np.stack([values] * self.n_channels, axis=1)
+        return (
+            values
+            if self.n_channels is None
+            else np.stack(
+                [values] * self.n_channels,
+                axis=1,
+            )
+        )
 
 
 def test_an_attribute_is_added_to_cached_signatures_without_new_eigenpairs(

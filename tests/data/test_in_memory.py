@@ -63,7 +63,10 @@ def test_arrays_have_their_spacing_and_are_cached_by_what_they_hold(tmp_path):
         assert dataset.bodies.names == ("a",)
         again = SignatureDataset({"b": (labels == 2, spacing)}, CONFIG, tmp_path)
         assert again.cached_keys() == dataset.cached_keys()
-    expected = pytest.approx([2 * (labels == 2).sum(), (labels == 2).sum()], rel=1e-3)
+    expected = pytest.approx(
+        [2 * (labels == 2).sum(), (labels == 2).sum()],
+        rel=1e-3,
+    )
     assert volumes == expected
 
 
@@ -75,7 +78,11 @@ def test_each_has_a_label():
 
 
 def test_an_executor_gets_them_too(tmp_path):
-    dataset = SignatureDataset({"a": BALL, "b": BALL.copy().apply_scale(2)}, CONFIG, tmp_path)
+    dataset = SignatureDataset(
+        {"a": BALL, "b": BALL.copy().apply_scale(2)},
+        CONFIG,
+        tmp_path,
+    )
     with ThreadPoolExecutor(2) as executor:
         assert dataset.precompute(executor, progress=False) == []
     assert dataset[1].signature.volume == pytest.approx(8 * BALL.volume)

@@ -3,7 +3,12 @@ import torch
 
 from igps.data.samplers import BucketBatchSampler
 
-SIZES = torch.randint(1000, 4000, (403,), generator=torch.Generator().manual_seed(0))
+SIZES = torch.randint(
+    1000,
+    4000,
+    (403,),
+    generator=torch.Generator().manual_seed(0),
+)
 
 
 def test_every_shape_comes_once_in_batches_of_the_size_asked():
@@ -23,7 +28,11 @@ def padding(batches):
 
 
 def test_padding_is_a_small_part_of_that_of_random_batches():
-    sampler = BucketBatchSampler(SIZES.tolist(), 8, generator=torch.Generator().manual_seed(0))
+    sampler = BucketBatchSampler(
+        SIZES.tolist(),
+        8,
+        generator=torch.Generator().manual_seed(0),
+    )
     random = torch.randperm(403, generator=torch.Generator().manual_seed(0)).split(8)
     assert padding([one.tolist() for one in random]) > 0.3
     assert padding(list(sampler)) < 0.1

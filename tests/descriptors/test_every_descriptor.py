@@ -41,7 +41,10 @@ def rod():
     # Caps as on a capsule, a tube between them.
     profile = np.sqrt(np.clip(1 - np.abs(x) ** 6, 0, 1))
     along = 1.6 * np.sign(x) * np.abs(x) ** 1.2
-    return np.stack([along, radius * profile * y / ring, radius * profile * z / ring], axis=1)
+    return np.stack(
+        [along, radius * profile * y / ring, radius * profile * z / ring],
+        axis=1,
+    )
 
 
 @cache
@@ -53,7 +56,10 @@ def bent(vertices, angle=1.6):
     """Bent around an arc that keeps the lengths along the axis."""
     x, y, z = vertices.T
     radius = 2 * 1.6 / angle
-    return np.stack([(radius + y) * np.sin(x / radius), (radius + y) * np.cos(x / radius), z], 1)
+    return np.stack(
+        [(radius + y) * np.sin(x / radius), (radius + y) * np.cos(x / radius), z],
+        1,
+    )
 
 
 def disc(vertices):
@@ -71,18 +77,37 @@ def body(kind):
         "other": disc,
     }
     # Mesh turns what a reflection has turned inside out.
-    mesh = Mesh(change[kind](rod()), np.asarray(unit_sphere().faces), name=kind)
-    everything = reduce(or_, (descriptor(name).requirements for name in NAMES), Requirements())
+    mesh = Mesh(
+        change[kind](rod()),
+        np.asarray(unit_sphere().faces),
+        name=kind,
+    )
+    everything = reduce(
+        or_,
+        (descriptor(name).requirements for name in NAMES),
+        Requirements(),
+    )
     config = SignatureConfig(
         n_eigenpairs=250, resolution=24, min_samples=400, n_surface_samples=600
     )
-    return collate([compute_signature(mesh, everything.apply_to(config))], [mesh])
+    return collate(
+        [compute_signature(mesh, everything.apply_to(config))],
+        [mesh],
+    )
 
 
 def signature(eigenvalues, interior, surface, of):
     config = SignatureConfig(n_eigenpairs=len(eigenvalues))
     sizes = (of.area, of.volume)
-    return Signature(eigenvalues, interior, surface, *sizes, config, of.id, measures=of.measures)
+    return Signature(
+        eigenvalues,
+        interior,
+        surface,
+        *sizes,
+        config,
+        of.id,
+        measures=of.measures,
+    )
 
 
 @cache
@@ -121,7 +146,14 @@ def test_padding_changes_no_description(name):
     meshes = []
     for batch in (body("rod"), body("other")):
         (one,) = batch.bodies()
-        signatures.append(signature(one.eigenvalues, one.interior, one.surface, one))
+        signatures.append(
+            signature(
+                one.eigenvalues,
+                one.interior,
+                one.surface,
+                one,
+            )
+        )
         meshes += batch.meshes or ()
     assert len(signatures[0].interior) != len(signatures[1].interior)
     with torch.inference_mode():
@@ -147,7 +179,16 @@ def test_half_precision_describes_nearly_the_same(name):
         halved = descriptor(name).to(torch.bfloat16)(body("rod"))
         of_half = descriptor(name)(body("rod").to(torch.bfloat16))
     for found in (halved, of_half):
-        assert float(torch.cosine_similarity(found.flatten().float(), expected, dim=0)) > 0.98
+        assert (
+            float(
+                torch.cosine_similarity(
+                    found.flatten().float(),
+                    expected,
+                    dim=0,
+                )
+            )
+            > 0.98
+        )
 
 
 @pytest.mark.parametrize("compiled", [True, False])
@@ -207,7 +248,12 @@ def test_a_batch_on_a_device_is_described_at_once(name, request, monkeypatch):
             together = found(several)
         counts.append(counting.found)
     assert counts[0] == counts[1]
-    assert_close(together, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+    assert_close(
+        together,
+        expected,
+        rtol=1e-4,
+        atol=1e-5 * float(expected.abs().max()),
+    )
 
 
 @pytest.mark.parametrize("name", ["interior", "pretrained"])
@@ -221,7 +267,12 @@ def test_any_number_of_bodies_goes_through_an_exported_program(name):
     with torch.no_grad():
         program = exported(found, SignatureBatch.concatenate([rod, other]))
         for batch in (several, other):
-            assert_close(program(*tensors(batch)), found(batch), rtol=0, atol=1e-6)
+            assert_close(
+                program(*tensors(batch)),
+                found(batch),
+                rtol=0,
+                atol=1e-6,
+            )
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -236,7 +287,12 @@ def test_cuda_describes_as_the_cpu_does(name):
         found_distances = found.distances(described, described)
     scale = float(expected.abs().max())
     assert_close(described.cpu(), expected, rtol=1e-4, atol=1e-5 * scale)
-    assert_close(found_distances.cpu(), distances, rtol=1e-3, atol=1e-4 * float(distances.max()))
+    assert_close(
+        found_distances.cpu(),
+        distances,
+        rtol=1e-3,
+        atol=1e-4 * float(distances.max()),
+    )
 
 
 @pytest.mark.parametrize("name", ["gps", "rich+", "pretrained+"])
@@ -263,8 +319,15 @@ def test_distances_are_a_matrix_of_what_pairs_give(name):
     assert abs(float(matrix[1, 0])) < 1e-3 * scale
     for i in range(2):
         for j in range(3):
-            pair = distance(queries[i : i + 1], gallery[j : j + 1])
-            expected = pytest.approx(matrix[i, j].item(), rel=1e-4, abs=1e-5 * scale)
+            pair = distance(
+                queries[i : i + 1],
+                gallery[j : j + 1],
+            )
+            expected = pytest.approx(
+                matrix[i, j].item(),
+                rel=1e-4,
+                abs=1e-5 * scale,
+            )
             assert pair.item() == expected
 
 
@@ -316,18 +379,33 @@ def test_a_batch_without_what_is_needed_is_refused(name):
             Samples(of.points, of.eigenfunctions[:, :n], of.attributes)
             for of in (one.interior, one.surface)
         ]
-        batch = collate([signature(one.eigenvalues[:n], *fewer, one)], whole.meshes)
+        batch = collate(
+            [signature(one.eigenvalues[:n], *fewer, one)],
+            whole.meshes,
+        )
         with pytest.raises(ValueError, match=f"^n_eigenpairs: .* at least {n + 1}, got {n}"):
             found(batch)
     if found.requirements.attributes:
         bare = [Samples(of.points, of.eigenfunctions) for of in (one.interior, one.surface)]
-        batch = collate([signature(one.eigenvalues, *bare, one)], whole.meshes)
+        batch = collate(
+            [signature(one.eigenvalues, *bare, one)],
+            whole.meshes,
+        )
         with pytest.raises(
             ValueError,
             match=f"^attributes: .* needs signatures with {', '.join(found.requirements.attributes)}",
         ):
             found(batch)
     if found.requirements.mesh:
-        batch = collate([signature(one.eigenvalues, one.interior, one.surface, one)])
+        batch = collate(
+            [
+                signature(
+                    one.eigenvalues,
+                    one.interior,
+                    one.surface,
+                    one,
+                )
+            ]
+        )
         with pytest.raises(ValueError, match=r"^meshes: this descriptor needs the surfaces too"):
             found(batch)

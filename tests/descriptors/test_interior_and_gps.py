@@ -18,7 +18,10 @@ N_EIGENPAIRS = 60
 def signature(blob):
     config = SignatureConfig(n_eigenpairs=80, resolution=24, min_samples=300, n_surface_samples=400)
     # Long, so that its ends lie far from the middle and several classes are filled.
-    return compute_signature(Mesh(blob.vertices * [1, 1, 4], blob.faces), config)
+    return compute_signature(
+        Mesh(blob.vertices * [1, 1, 4], blob.faces),
+        config,
+    )
 
 
 @pytest.mark.parametrize("samples", ["interior", "surface"])
@@ -29,7 +32,11 @@ def test_histograms_are_those_of_the_layout(signature, samples):
         getattr(signature, samples).eigenfunctions, signature.eigenvalues, N_EIGENPAIRS
     )
     with torch.inference_mode():
-        np.testing.assert_allclose(found(igps.collate([signature]))[0], expected, atol=2e-6)
+        np.testing.assert_allclose(
+            found(igps.collate([signature]))[0],
+            expected,
+            atol=2e-6,
+        )
     assert (expected > 0).any(axis=1).sum() >= 3, "several classes are seen"
 
 

@@ -23,7 +23,10 @@ def ellipsoid(*semi_axes, unit=None):
 
 def test_signatures_of_files_hold_the_numbers_of_their_meshes(tmp_path):
     for height in (1, 2):
-        tall = trimesh.Trimesh(SPHERE.vertices * [1, 1, height], SPHERE.faces)
+        tall = trimesh.Trimesh(
+            SPHERE.vertices * [1, 1, height],
+            SPHERE.faces,
+        )
         tall.export(tmp_path / f"{height}.off")
     described = igps.SignatureDataset(tmp_path, descriptor=Measures(), cache_dir=tmp_path / "cache")
     assert described.precompute(progress=False, n_workers=1) == []
@@ -35,7 +38,11 @@ def test_signatures_of_files_hold_the_numbers_of_their_meshes(tmp_path):
 
 
 def test_scaled_bodies_differ_by_their_size_alone():
-    bodies = [ellipsoid(1, 2, 3), ellipsoid(2, 4, 6), ellipsoid(1, 1, 3)]
+    bodies = [
+        ellipsoid(1, 2, 3),
+        ellipsoid(2, 4, 6),
+        ellipsoid(1, 1, 3),
+    ]
     bodies.append(ellipsoid(0.1, 0.2, 0.3, unit="cm"))
     batch = collate([compute_signature(body, CONFIG) for body in bodies])
     found = igps.descriptor("measures")
@@ -50,11 +57,19 @@ def test_scaled_bodies_differ_by_their_size_alone():
     doubled = (logarithms[1] - logarithms[0])[has_unit]
     expected = torch.full_like(doubled, math.log(2))
     torch.testing.assert_close(doubled, expected, atol=1e-3, rtol=0)
-    torch.testing.assert_close(logarithms[3], logarithms[0], atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        logarithms[3],
+        logarithms[0],
+        atol=1e-3,
+        rtol=0,
+    )
 
 
 def test_bodies_without_numbers_are_refused():
-    bare = replace(compute_signature(ellipsoid(1, 2, 3), CONFIG), measures={})
+    bare = replace(
+        compute_signature(ellipsoid(1, 2, 3), CONFIG),
+        measures={},
+    )
     with pytest.raises(ValueError, match=r"^measures: expected bodies with plain numbers"):
         igps.descriptor("measures")(collate([bare]))
 

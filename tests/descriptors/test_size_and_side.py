@@ -36,7 +36,11 @@ def twisted(turns, scale=1.0, unit=None, mirrored=False):
     beside = np.sin(angle) * x + np.cos(angle) * y
     points = scale * np.stack([across, beside, z], axis=1)
     if mirrored:
-        return Mesh(points * [1, -1, 1], SURFACE.faces[:, ::-1], unit=unit)
+        return Mesh(
+            points * [1, -1, 1],
+            SURFACE.faces[:, ::-1],
+            unit=unit,
+        )
     return Mesh(points, SURFACE.faces, unit=unit)
 
 
@@ -65,7 +69,11 @@ def test_distances_with_size_are_those_of_the_formula(name, signatures):
     plain = from_body(name, signatures)
     sized = from_body(f"{name}+size", signatures)
     for other in ("body", "centimetres", "mirrored"):
-        assert sized[other] == pytest.approx(plain[other], rel=1e-2, abs=1e-3 * SCALES[name])
+        assert sized[other] == pytest.approx(
+            plain[other],
+            rel=1e-2,
+            abs=1e-3 * SCALES[name],
+        )
     apart = 5 * np.log(1.1)  # in log area and in log volume
     n = SCALES[name] / 4
     expected = plain["larger"] + (plain["larger"] + n) * apart / 0.5
@@ -139,8 +147,14 @@ def bent(mirrored=False, turn=None):
     beside = wide * y + 0.6 * np.maximum(along, 0) ** 2
     points = np.stack([across, beside, along], axis=1)
     if mirrored:
-        return Mesh(points * [1, 1, -1], SURFACE.faces[:, ::-1])
-    return Mesh(points if turn is None else points @ turn.T * 3 + 5, SURFACE.faces)
+        return Mesh(
+            points * [1, 1, -1],
+            SURFACE.faces[:, ::-1],
+        )
+    return Mesh(
+        points if turn is None else points @ turn.T * 3 + 5,
+        SURFACE.faces,
+    )
 
 
 def test_signed_volumes_turn_their_signs_with_a_mirror_image_and_are_blind_to_motion_scale_and_padding():
@@ -276,7 +290,12 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path, capsys):
     dataset = igps.SignatureDataset(root, cache_dir=tmp_path / "cache", descriptor=by_dna)
     assert dataset.units() == ["in", "mm", "mm", "cm"]
     Gallery.build(tmp_path / "index", dataset, "shape_dna+size", n_workers=1)
-    found = query(root / "1/a.3mf", gallery=tmp_path / "index", top=2, cache_dir=tmp_path / "cache")
+    found = query(
+        root / "1/a.3mf",
+        gallery=tmp_path / "index",
+        top=2,
+        cache_dir=tmp_path / "cache",
+    )
     assert [row["name"] for row in found] == ["1/a.3mf", "1/b.3mf"]
     with pytest.raises(
         ValueError,

@@ -26,7 +26,13 @@ def even_directions(n, seed=0):
     z = 1 - (2 * np.arange(n) + 1) / n
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
     ring = np.sqrt(1 - z**2)
-    directions = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), z])
+    directions = np.column_stack(
+        [
+            ring * np.cos(angle),
+            ring * np.sin(angle),
+            z,
+        ]
+    )
     return Rotation.random(random_state=seed).apply(directions)
 
 
@@ -49,17 +55,28 @@ def bumpy(amplitude, n=2000, seed=0):
     upward = np.eye(3)[2] - z[:, None] * directions
     normals = directions - amplitude * (slope / radius)[:, None] * upward
     normals /= norm(normals, axis=1, keepdims=True)
-    return SurfaceSamples.of(radius[:, None] * directions, normals, 4 * np.pi)
+    return SurfaceSamples.of(
+        radius[:, None] * directions,
+        normals,
+        4 * np.pi,
+    )
 
 
 def moved(samples, seed, mirror, scale):
     turn = Rotation.random(random_state=seed).as_matrix() * (-1 if mirror else 1)
     shuffled = np.random.default_rng(seed).permutation(len(samples.points))
     points = (scale * samples.points @ turn.T + [3.0, -1.0, 2.0])[shuffled]
-    return SurfaceSamples.of(points, (samples.normals @ turn.T)[shuffled], scale**2)
+    return SurfaceSamples.of(
+        points,
+        (samples.normals @ turn.T)[shuffled],
+        scale**2,
+    )
 
 
-@pytest.mark.parametrize(("seed", "mirror", "scale"), [(1, False, 1.0), (2, True, 7.0)])
+@pytest.mark.parametrize(
+    ("seed", "mirror", "scale"),
+    [(1, False, 1.0), (2, True, 7.0)],
+)
 def test_a_motion_a_mirror_and_a_scale_leave_nothing(seed, mirror, scale):
     """Of a body without any symmetry: two ellipsoids beside each other."""
     one = ellipsoid((1.0, 0.6, 0.4))
@@ -103,7 +120,11 @@ def test_fine_relief_cancels_but_another_shape_does_not():
     """Ripples within a patch of ten samples average out; their root mean square is amplitude/√2."""
     amplitude, area = 0.01, 6.1
     plain, ruffled = (
-        SurfaceSamples.of(*rough(a, 2000, seed), area) for a, seed in ((0.0, 1), (amplitude, 2))
+        SurfaceSamples.of(
+            *rough(a, 2000, seed),
+            area,
+        )
+        for a, seed in ((0.0, 1), (amplitude, 2))
     )
     high = amplitude / np.sqrt(2) / np.sqrt(area)
     lost = surface_distance(plain, ruffled)
@@ -124,7 +145,13 @@ def test_the_surface_itself_tells_more_than_samples():
     axes = (1.0, 0.6, 0.4)
     vertices, faces = triangles(axes, 5)
     few = [ellipsoid(axes, 300, seed) for seed in (1, 2)]
-    with_surface = [replace(one, surface=lambda: TriangleSurface(vertices, faces)) for one in few]
+    with_surface = [
+        replace(
+            one,
+            surface=lambda: TriangleSurface(vertices, faces),
+        )
+        for one in few
+    ]
     assert surface_distance(*with_surface) < 0.05 * surface_distance(*few)
 
 
@@ -133,7 +160,11 @@ def test_nearest_points_of_a_surface():
     vertices, faces = triangles((1.0, 0.6, 0.4), 2)
     surface = TriangleSurface(vertices, faces)
     body = trimesh.Trimesh(vertices, faces, process=False)
-    anywhere = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    anywhere = np.random.default_rng(0).uniform(
+        -1,
+        1,
+        (40, 3),
+    )
     expected, _, _ = trimesh.proximity.closest_point_naive(body, anywhere)
     found, _ = surface.nearest(SurfaceSamples(anywhere, anywhere))
     assert_allclose(found, expected, atol=1e-12)
@@ -147,7 +178,10 @@ def test_in_place_nothing_is_moved():
     """A ball and itself moved by h along a line: h/√3, the root mean square of h·cos θ; laid onto itself, nothing."""
     vertices, faces = triangles((1.0, 1.0, 1.0), 5)
     step = np.array([0.0, 0.0, 0.02])
-    ball = replace(ellipsoid((1.0, 1.0, 1.0)), surface=lambda: TriangleSurface(vertices, faces))
+    ball = replace(
+        ellipsoid((1.0, 1.0, 1.0)),
+        surface=lambda: TriangleSurface(vertices, faces),
+    )
     shifted = TriangleSurface(vertices + step, faces)
     beside = SurfaceSamples(ball.points + step, ball.normals, lambda: shifted)
     expected = pytest.approx(0.02 / np.sqrt(3), rel=0.03)
@@ -160,7 +194,10 @@ def test_distances_beyond_an_edge_are_those_to_the_edge():
     box = trimesh.creation.box((1.0, 1.0, 0.1))
     x = np.linspace(-0.4, 0.4, 30)
     points = np.column_stack([x, np.full(30, 0.53), np.full(30, 0.09)])
-    beyond = SurfaceSamples(points, np.tile([0.0, 0.6, 0.8], (30, 1)))
+    beyond = SurfaceSamples(
+        points,
+        np.tile([0.0, 0.6, 0.8], (30, 1)),
+    )
     found = offset_in_place(beyond, TriangleSurface(box.vertices, box.faces))
     assert found == pytest.approx(0.05)
 
@@ -170,17 +207,37 @@ def test_thin_sheets_of_other_widths_are_told_apart():
 
     def sheet(length, width):
         n = 40
-        x, y = np.meshgrid((np.arange(n) + 0.5) / n * length, (np.arange(n) + 0.5) / n * width)
-        top = np.column_stack([x.ravel(), y.ravel(), np.full(n * n, 0.003 * length)])
+        x, y = np.meshgrid(
+            (np.arange(n) + 0.5) / n * length,
+            (np.arange(n) + 0.5) / n * width,
+        )
+        top = np.column_stack(
+            [
+                x.ravel(),
+                y.ravel(),
+                np.full(n * n, 0.003 * length),
+            ]
+        )
         up = np.tile([0.0, 0.0, 1.0], (n * n, 1))
         points = np.concatenate([top, top * [1, 1, -1]])
-        return SurfaceSamples.of(points, np.concatenate([up, -up]), 2 * length * width)
+        return SurfaceSamples.of(
+            points,
+            np.concatenate([up, -up]),
+            2 * length * width,
+        )
 
     same = surface_distance(sheet(2.0, 1.0), sheet(4.0, 2.0))
     assert same < 1e-5
     # At unit area, the sheets end at 0.5 and 0.61, or at 0.53 and 0.58 if scaled by a tenth. Points farther than the
     # gap of 0.044 then add at least √(0.011²/3 · 0.02 / 2), or √(0.068²/3 · 0.11 / 2) without scaling.
-    assert 0.0006 < surface_distance(sheet(2.0, 1.0), sheet(3.0, 1.0)) < 0.009
+    assert (
+        0.0006
+        < surface_distance(
+            sheet(2.0, 1.0),
+            sheet(3.0, 1.0),
+        )
+        < 0.009
+    )
 
 
 def test_what_is_farther_than_asked_for_is_told_to_be():
@@ -205,10 +262,17 @@ def part(step=0.0, boss=0.0, hole=4.0, sections=32):
 
 
 def sampled(body):
-    points, faces = trimesh.sample.sample_surface(body, 1500, seed=len(body.faces))
+    points, faces = trimesh.sample.sample_surface(
+        body,
+        1500,
+        seed=len(body.faces),
+    )
     samples = SurfaceSamples.of(points, body.face_normals[faces], body.area)
     vertices = (body.vertices - points.mean(axis=0)) / body.area**0.5
-    surface = TriangleSurface(vertices, np.asarray(body.faces, dtype=np.int64))
+    surface = TriangleSurface(
+        vertices,
+        np.asarray(body.faces, dtype=np.int64),
+    )
     return replace(samples, surface=lambda: surface)
 
 
@@ -230,7 +294,10 @@ def test_only_a_reflection_lays_a_chiral_part_onto_its_mirror_image():
     surface = one.surface()
     vertices, faces = surface._triangles
     mirror = np.array([-1.0, 1.0, 1.0])
-    mirrored = TriangleSurface(vertices * mirror, np.ascontiguousarray(faces[:, ::-1]))
+    mirrored = TriangleSurface(
+        vertices * mirror,
+        np.ascontiguousarray(faces[:, ::-1]),
+    )
     other = SurfaceSamples.of(one.points * mirror, one.normals * mirror, 1.0)
     other = replace(other, surface=lambda: mirrored)
     apart = {side: surface_distance(one, other, side=side) for side in ("same", "mirrored")}

@@ -64,14 +64,20 @@ def test_the_words_say_what_is_counted(calibration, drawn):
         side, _, share, *_ = part.split()
         counted = (drawn[kind] < distance).mean()
         assert side == ("closer" if counted < 0.5 else "farther")
-        expected = pytest.approx(100 * max(counted, 1 - counted), abs=2)
+        expected = pytest.approx(
+            100 * max(counted, 1 - counted),
+            abs=2,
+        )
         assert float(share) == expected
     assert "closer than all pairs of different classes" in calibration.words(0.0)
 
 
 def test_a_share_is_never_rounded_up(calibration):
     """What 99.96 % are farther than is not all."""
-    ends = replace(calibration, distances={kind: list(np.array(LEVELS) + 0.0) for kind in KINDS})
+    ends = replace(
+        calibration,
+        distances={kind: list(np.array(LEVELS) + 0.0) for kind in KINDS},
+    )
     assert "closer than 99.9 % of poses of one body" in ends.words(0.0004)
     assert "closer than 98 % of poses of one body" in ends.words(0.011)
 
@@ -92,7 +98,11 @@ def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(calibrati
 
 @pytest.mark.parametrize(
     ("coarseness", "limit"),
-    [(0.0, 0.00006), (0.02, 0.12), (np.inf, 0.5)],
+    [
+        (0.0, 0.00006),
+        (0.02, 0.12),
+        (np.inf, 0.5),
+    ],
 )
 def test_what_is_coarse_may_be_farther_apart(calibration, coarseness, limit):
     """Six times the coarseness, of which there is a least, and never more than any copies are."""
@@ -104,7 +114,10 @@ def test_what_is_saved_is_loaded(calibration, tmp_path):
     assert Calibration.load(tmp_path / "c.json") == calibration
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", json.dumps({"descriptor": "pretrained"})])
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", "{}", json.dumps({"descriptor": "pretrained"})],
+)
 def test_what_is_no_calibration_is_refused(text, tmp_path):
     (tmp_path / "c.json").write_text(text)
     with pytest.raises(

@@ -62,7 +62,11 @@ def bar(subdivisions, bend=0.0):
 def copied(body, seed, scale):
     """Scaled, turned, and mirrored."""
     turn = -scale * Rotation.random(random_state=seed).as_matrix()
-    return trimesh.Trimesh(body.vertices @ turn.T + 5.0, body.faces[:, ::-1], process=False)
+    return trimesh.Trimesh(
+        body.vertices @ turn.T + 5.0,
+        body.faces[:, ::-1],
+        process=False,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +121,16 @@ def test_pairs_are_graded(tmp_path):
     """A file beside its copy, the mesh turned and scaled, its vertices in another order, or fewer, and a sibling."""
     body = bar(4)
     order = np.random.default_rng(0).permutation(len(body.vertices))
-    renumbered = trimesh.Trimesh(body.vertices[order], np.argsort(order)[body.faces], process=False)
+    renumbered = trimesh.Trimesh(
+        body.vertices[order],
+        np.argsort(order)[body.faces],
+        process=False,
+    )
     longer = renumbered.copy()
-    longer.vertices += np.outer(longer.vertices[:, 0] > 0, [0.005 * body.area**0.5, 0, 0])
+    longer.vertices += np.outer(
+        longer.vertices[:, 0] > 0,
+        [0.005 * body.area**0.5, 0, 0],
+    )
     files = {
         "a.off": body,
         "b.ply": copied(body, 2, 0.2),
@@ -146,7 +157,10 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
 
     def labels(side):
-        x, y, z = np.meshgrid(*(np.arange(0, n, side) for n in (60, 36, 30)), indexing="ij")
+        x, y, z = np.meshgrid(
+            *(np.arange(0, n, side) for n in (60, 36, 30)),
+            indexing="ij",
+        )
         height = z - 12 - (x - 8) * y / 90
         one = ((x - 18) / 14) ** 2 + ((y - 18) / 11) ** 2 + (height / 8) ** 2 < 1
         height = z - 15 + (y - 18) * (x - 39) / 70
@@ -159,14 +173,27 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
     turn[[0, 1, 2, 3], [1, 2, 0, 3]] = [-1, 1, 1, 1]
     turn[0, 3] = len(given) - 1
     inner = given[2:, 1:-1, 3:]
-    nibabel.save(nibabel.Nifti1Image(given, np.eye(4)), tmp_path / "given.nii.gz")
-    nibabel.save(nibabel.MGHImage(given, np.eye(4)), tmp_path / "mgh.mgz")
-    nibabel.save(nibabel.Nifti1Image(given[::-1].transpose(2, 0, 1), turn), tmp_path / "turned.nii")
+    nibabel.save(
+        nibabel.Nifti1Image(given, np.eye(4)),
+        tmp_path / "given.nii.gz",
+    )
+    nibabel.save(
+        nibabel.MGHImage(given, np.eye(4)),
+        tmp_path / "mgh.mgz",
+    )
+    nibabel.save(
+        nibabel.Nifti1Image(given[::-1].transpose(2, 0, 1), turn),
+        tmp_path / "turned.nii",
+    )
     shifted = np.eye(4)
     shifted[:3, 3] = (2, 1, 3)
     nibabel.save(nibabel.Nifti1Image(inner, shifted), tmp_path / "cropped.nii")
     nibabel.save(
-        nibabel.Nifti1Image(labels(1.4), np.diag([1.4, 1.4, 1.4, 1])), tmp_path / "sampled.nii"
+        nibabel.Nifti1Image(
+            labels(1.4),
+            np.diag([1.4, 1.4, 1.4, 1]),
+        ),
+        tmp_path / "sampled.nii",
     )
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     found = duplicates(dataset, n_workers=1)
@@ -184,7 +211,10 @@ def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path):
     """
     fine = bar(5)
     longer = fine.copy()
-    longer.vertices += np.outer(fine.vertices[:, 0] > 0, [0.01 * fine.area**0.5, 0, 0])
+    longer.vertices += np.outer(
+        fine.vertices[:, 0] > 0,
+        [0.01 * fine.area**0.5, 0, 0],
+    )
     for name, body in (("one", fine), ("copy", copied(fine, 3, 2.0)), ("longer", longer)):
         body.export(tmp_path / f"{name}.off")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
@@ -196,7 +226,10 @@ def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path):
     """It is near enough to both, as coarse as it is, and belongs to the nearer one."""
     fine = bar(5)
     longer = fine.copy()
-    longer.vertices += np.outer(fine.vertices[:, 0] > 0, [0.01 * fine.area**0.5, 0, 0])
+    longer.vertices += np.outer(
+        fine.vertices[:, 0] > 0,
+        [0.01 * fine.area**0.5, 0, 0],
+    )
     for name, body in (("one", fine), ("longer", longer), ("coarse", copied(bar(3), 3, 2.0))):
         body.export(tmp_path / f"{name}.off")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
@@ -223,12 +256,20 @@ def test_each_file_of_a_group_has_one_finer_file_beside_it():
             return apart.get((min(i, j), max(i, j)), math.inf)
 
     calibration = Calibration.load()
-    found = assigned([0, 1, 2, 3, 4], Table(), calibration)
+    found = assigned(
+        [0, 1, 2, 3, 4],
+        Table(),
+        calibration,
+    )
     # 3 is as fine as 0 and leads; 2 is the same as 3, which leads, and as 1, which does not.
     expected = {(0, 1): 0.1, (3, 2): 0.3, (3, 4): 0.1}
     assert found == expected
     del apart[2, 3]
-    found = assigned([0, 1, 2, 3, 4], Table(), calibration)
+    found = assigned(
+        [0, 1, 2, 3, 4],
+        Table(),
+        calibration,
+    )
     expected = {(0, 1): 0.1, (1, 2): 0.05, (3, 4): 0.1}
     assert found == expected
 
@@ -236,9 +277,17 @@ def test_each_file_of_a_group_has_one_finer_file_beside_it():
 def test_handles_tell_bodies_apart_however_near_they_are(tmp_path):
     """But not where mending may have made them, or closed them."""
     ring = trimesh.creation.torus(1.0, 0.3, 40, 20)
-    kept = ~np.isin(np.arange(len(ring.faces)), ring.vertex_faces[5])
+    kept = ~np.isin(
+        np.arange(len(ring.faces)),
+        ring.vertex_faces[5],
+    )
     cut = ring.submesh([kept], append=True, repair=False)
-    bodies = {"ball": ball(3), "cut": cut, "ring": ring, "turned": copied(ring, 1, 3.0)}
+    bodies = {
+        "ball": ball(3),
+        "cut": cut,
+        "ring": ring,
+        "turned": copied(ring, 1, 3.0),
+    }
     for name, body in bodies.items():
         body.export(tmp_path / f"{name}.off")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
@@ -274,7 +323,12 @@ def test_a_mirror_image_is_called_so(tmp_path):
     bracket = trimesh.boolean.union(boxes, engine="manifold")
     bracket.export(tmp_path / "left.off")
     turned = bracket.copy()
-    turned.apply_transform(trimesh.transformations.rotation_matrix(1.0, [1, 2, 3]))
+    turned.apply_transform(
+        trimesh.transformations.rotation_matrix(
+            1.0,
+            [1, 2, 3],
+        )
+    )
     turned.export(tmp_path / "copy.off")
     bracket.apply_scale([-1, 1, 1])
     bracket.export(tmp_path / "right.off")

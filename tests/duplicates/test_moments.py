@@ -16,7 +16,11 @@ MOST = 0.002
 
 
 def of(body, scale=1.0):
-    return moments(scale * body.vertices / body.area**0.5, np.asarray(body.faces), MOST)
+    return moments(
+        scale * body.vertices / body.area**0.5,
+        np.asarray(body.faces),
+        MOST,
+    )
 
 
 def apart(one, other, scale=1.0):
@@ -41,15 +45,36 @@ def test_moments_of_a_box_are_its_closed_forms():
     volume, (a, b, c) = 6.0, sides**2
     fourth = volume * ((a * a + b * b + c * c) / 80 + (a * b + b * c + a * c) / 72)
     second = volume * sides**2 / 12
-    expected = np.log([volume / area**1.5, *(second / area**2.5), fourth / area**3.5])
+    expected = np.log(
+        [
+            volume / area**1.5,
+            *(second / area**2.5),
+            fourth / area**3.5,
+        ]
+    )
     found = of(body)[0]
-    np.testing.assert_allclose(found, [*expected, 0.0], rtol=1e-9, atol=1e-5)
+    np.testing.assert_allclose(
+        found,
+        [*expected, 0.0],
+        rtol=1e-9,
+        atol=1e-5,
+    )
 
 
 def test_moments_of_a_tetrahedron_are_those_of_its_points():
     """By a product of Gauss's rules on the cube that is folded into it, exact up to the ninth degree."""
-    corners = np.array([[0.0, 0, 0], [2, 0.1, 0], [0.3, 1, 0], [0.2, 0.1, 0.7]])
-    body = trimesh.Trimesh(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    corners = np.array(
+        [
+            [0.0, 0, 0],
+            [2, 0.1, 0],
+            [0.3, 1, 0],
+            [0.2, 0.1, 0.7],
+        ]
+    )
+    body = trimesh.Trimesh(
+        corners,
+        [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
+    )
     nodes, weights = np.polynomial.legendre.leggauss(6)
     places = np.array(list(product((nodes + 1) / 2, repeat=3)))
     r, s, t = places.T
@@ -78,13 +103,21 @@ def test_a_motion_a_mirror_image_and_other_triangles_leave_nothing():
 
 
 @pytest.mark.parametrize(
-    ("stretch", "bumps"), [((1.0, 1.0, 1.0), 0.0), ((1.0, 1.0, 0.4), 0.1), ((3.0, 0.8, 0.5), 0.1)]
+    ("stretch", "bumps"),
+    [
+        ((1.0, 1.0, 1.0), 0.0),
+        ((1.0, 1.0, 0.4), 0.1),
+        ((3.0, 0.8, 0.5), 0.1),
+    ],
 )
 def test_the_lower_bound_does_not_exceed_the_displacement(stretch, bumps):
     """Normal displacements by polynomials, scaled to a known root mean square; bodies with and without symmetry."""
     body = lump(stretch, bumps)
     normals = np.asarray(body.vertex_normals)
-    weights = np.bincount(body.faces.ravel(), np.repeat(body.area_faces, 3))
+    weights = np.bincount(
+        body.faces.ravel(),
+        np.repeat(body.area_faces, 3),
+    )
     places = body.vertices / np.abs(body.vertices).max(axis=0)
     told = []
     for powers in product(range(4), repeat=3):

@@ -15,7 +15,13 @@ from igps.sklearn import VolumetricFeatures
 SHAPE = (16, 18, 12)
 SPACING = (1.0, 0.8, 1.5)
 # Turned about the third axis, and moved
-TURN = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+TURN = np.array(
+    [
+        [0.8, -0.6, 0.0],
+        [0.6, 0.8, 0.0],
+        [0.0, 0.0, 1.0],
+    ]
+)
 AFFINE = np.eye(4)
 AFFINE[:3, :3] = TURN * SPACING
 AFFINE[:3, 3] = [-30.0, 12.0, 5.0]
@@ -24,7 +30,10 @@ AFFINE[:3, 3] = [-30.0, 12.0, 5.0]
 def world(affine=AFFINE, shape=SHAPE):
     """The centres of all voxels."""
     indices = np.indices(shape).reshape(3, -1).T
-    return (indices @ affine[:3, :3].T + affine[:3, 3]).reshape(*shape, 3)
+    return (indices @ affine[:3, :3].T + affine[:3, 3]).reshape(
+        *shape,
+        3,
+    )
 
 
 CENTRE = world().reshape(-1, 3).mean(axis=0)
@@ -35,7 +44,10 @@ IMAGE = np.exp(-np.linalg.norm(world() - CENTRE - [2, 0, 1], axis=-1) / 4).astyp
 @pytest.fixture(scope="module")
 def expected():
     (row,) = igps.inside(IMAGE, LABELS, SPACING)
-    expected = pytest.approx(LABELS.sum() * np.prod(SPACING), rel=0.01)
+    expected = pytest.approx(
+        LABELS.sum() * np.prod(SPACING),
+        rel=0.01,
+    )
     assert row["volume"] == expected
     return row
 
@@ -69,8 +81,14 @@ def test_an_image_on_another_grid_is_read_by_its_place():
     affine = np.diag([0.9, 1.1, 1.3, 1.0])
     affine[:3, 3] = CENTRE - np.array([13.5, 16.5, 19.5])
     slope = np.array([0.7, -1.3, 2.1])
-    image = in_nibabel(world(affine, (31, 31, 31)) @ slope, affine)
-    (row,) = igps.inside({"image": image, "same": in_nibabel(world() @ slope)}, in_nibabel(LABELS))
+    image = in_nibabel(
+        world(affine, (31, 31, 31)) @ slope,
+        affine,
+    )
+    (row,) = igps.inside(
+        {"image": image, "same": in_nibabel(world() @ slope)},
+        in_nibabel(LABELS),
+    )
     assert row["image.mean"] == pytest.approx(row["same.mean"], rel=1e-5)
     assert row["image.ends.q90"] == pytest.approx(row["same.ends.q90"], rel=1e-5)
     assert row["image_and_same.correlation"] == pytest.approx(1, abs=1e-6)
@@ -92,7 +110,11 @@ def test_what_cannot_be_compared_is_refused_with_a_sentence():
     three[5, 5, 3:6] = 1
     with pytest.raises(MeshError, match="expected at least 8 voxels, got 3"):
         igps.inside(IMAGE, three, SPACING)
-    holes = np.where(np.indices(SHAPE)[0] < 8, np.nan, IMAGE)
+    holes = np.where(
+        np.indices(SHAPE)[0] < 8,
+        np.nan,
+        IMAGE,
+    )
     with pytest.raises(MeshError, match="has no value at"):
         igps.inside(holes, LABELS, SPACING)
     elsewhere = AFFINE.copy()
@@ -117,7 +139,13 @@ def test_what_cannot_be_compared_is_refused_with_a_sentence():
 
 def test_rows_are_a_table_of_pandas(expected):
     pandas = pytest.importorskip("pandas")
-    table = pandas.DataFrame(igps.inside({"ct": IMAGE, "pet": IMAGE**2}, LABELS, SPACING))
+    table = pandas.DataFrame(
+        igps.inside(
+            {"ct": IMAGE, "pet": IMAGE**2},
+            LABELS,
+            SPACING,
+        )
+    )
     assert table["ct.rim.mean"][0] == pytest.approx(expected["image.rim.mean"])
     of_both = [name.removeprefix("ct_and_pet.") for name in table.filter(like="_and_")]
     assert of_both == ["correlation", "rank_correlation", "overlap", "information"]
@@ -145,9 +173,18 @@ def test_a_transform_of_monai_is_pickled_and_kept_by_its_caching_dataset(expecte
     transform = InteriorFeaturesd(keys="label", image_key="image", labels=(1, 2))
     assert transform.feature_names == column_names(["image"])
     channel = EnsureChannelFirstd(["image", "label"], channel_dim="no_channel")
-    chain = Compose([channel, pickle.loads(pickle.dumps(transform)), ToTensord("label_inside")])
+    chain = Compose(
+        [
+            channel,
+            pickle.loads(pickle.dumps(transform)),
+            ToTensord("label_inside"),
+        ]
+    )
     items = [
-        {"image": data.MetaTensor(IMAGE, AFFINE), "label": data.MetaTensor(LABELS, AFFINE)},
+        {
+            "image": data.MetaTensor(IMAGE, AFFINE),
+            "label": data.MetaTensor(LABELS, AFFINE),
+        },
         {"image": IMAGE, "label": LABELS},  # in voxels of side 1
     ]
     cached = data.CacheDataset(items, chain, progress=False)
@@ -155,7 +192,13 @@ def test_a_transform_of_monai_is_pickled_and_kept_by_its_caching_dataset(expecte
     assert "label_inside" not in items[0]
     first = cached[0]["label_inside"]
     assert first.shape == (2, len(transform.feature_names))
-    row = dict(zip(transform.feature_names, first[0].tolist(), strict=True))
+    row = dict(
+        zip(
+            transform.feature_names,
+            first[0].tolist(),
+            strict=True,
+        )
+    )
     check([row], expected)
     assert first[1].isnan().all()  # there is no label 2
     assert (cached[1]["label_inside"][0] != first[0]).any()
@@ -179,7 +222,10 @@ def test_features_of_scikit_learn_hold_the_numbers(expected, tmp_path):
     names = features.get_feature_names_out().tolist()
     assert table.shape == (1, len(names))
     assert names[-57:] == column_names(["image"])
-    check([dict(zip(names, table[0].tolist(), strict=True))], expected)
+    check(
+        [dict(zip(names, table[0].tolist(), strict=True))],
+        expected,
+    )
     with pytest.raises(TypeError, match="expected a list of attributes"):
         VolumetricFeatures(inside="ct").fit([tmp_path / "a.nii.gz"])
     surface = igps.as_mesh(LABELS > 0)

@@ -30,7 +30,11 @@ def dataset(tmp_path_factory):
     root = tmp_path_factory.mktemp("examples")
     for label, height in (("flat", 0.5), ("long", 2.0)):
         for i in range(4):
-            write_egg(root / "eggs" / label / f"{i}.off", height * (1 + 0.05 * i), subdivisions=2)
+            write_egg(
+                root / "eggs" / label / f"{i}.off",
+                height * (1 + 0.05 * i),
+                subdivisions=2,
+            )
     found = igps.SignatureDataset(root / "eggs", CONFIG, root / "cache")
     found.precompute(n_workers=1, progress=False)
     return found.to_memory()
@@ -69,7 +73,11 @@ class DiffusionBlock(nn.Module):
         super().__init__()
         self.log_time = nn.Parameter(torch.full((n_channels,), -3.0))
         first = nn.Linear(2 * n_channels, n_channels)
-        self.mix = nn.Sequential(first, nn.ReLU(), nn.Linear(n_channels, n_channels))
+        self.mix = nn.Sequential(
+            first,
+            nn.ReLU(),
+            nn.Linear(n_channels, n_channels),
+        )
 
     def diffused(self, x, eigenvalues, eigenfunctions, mass):
         """(P, D) values after a time, the constant eigenfunction included, which spectra leave out."""
@@ -93,7 +101,10 @@ def test_a_diffusion_net_reads_the_spectrum_of_a_surface():
     from igps.spectra.eigensolver import eigenpairs
 
     body = trimesh.creation.icosphere(subdivisions=3)
-    mesh = igps.Mesh(body.vertices * [1, 1.3, 0.8], body.faces)
+    mesh = igps.Mesh(
+        body.vertices * [1, 1.3, 0.8],
+        body.faces,
+    )
     stiffness, mass = laplacian(mesh)
     spectrum = eigenpairs(stiffness, mass, 200)
     eigenvalues = torch.tensor(spectrum.eigenvalues, dtype=torch.float32)
@@ -150,19 +161,33 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     from pytorch_metric_learning.utils.inference import CustomKNN
 
     torch.manual_seed(0)
-    axes = [Potential(3, learnable=True), InteriorDistance(12, learnable=True)]
+    axes = [
+        Potential(3, learnable=True),
+        InteriorDistance(12, learnable=True),
+    ]
     histogram = igps.PairHistogram(axes, SpectralEmbedding(n_eigenpairs=20))
     descriptor = igps.HistogramDescriptor(histogram)
     head = ProjectionHead(width=8, n_hidden=0, cell_dropout=0)
-    head.fit(igps.describe(dataset, descriptor).flatten(1), dataset.labels)
+    head.fit(
+        igps.describe(dataset, descriptor).flatten(1),
+        dataset.labels,
+    )
     distance = AsTheirs(head.distances)
     miner = BatchHardMiner(distance=distance)
     loss = TripletMarginLoss(margin=0.2, distance=distance)
     head(torch.ones(1, descriptor.n_features))
-    optimizer = torch.optim.Adam([*descriptor.parameters(), *head.parameters()], lr=0.01)
+    optimizer = torch.optim.Adam(
+        [*descriptor.parameters(), *head.parameters()],
+        lr=0.01,
+    )
     sampler = MPerClassSampler(dataset.labels, m=4, batch_size=8, length_before_new_iter=160)
     losses = []
-    for batch in DataLoader(dataset, batch_size=8, sampler=sampler, collate_fn=igps.collate):
+    for batch in DataLoader(
+        dataset,
+        batch_size=8,
+        sampler=sampler,
+        collate_fn=igps.collate,
+    ):
         embeddings = head(descriptor(batch).flatten(1))
         value = loss(embeddings, batch.labels, miner(embeddings, batch.labels))
         optimizer.zero_grad()
@@ -192,7 +217,12 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     layer = nn.Linear(plain.n_features, 4)
     before = layer.weight.detach().clone()
     models = {"trunk": trunk, "embedder": layer}
-    optimizers = {"embedder_optimizer": torch.optim.Adam(layer.parameters(), lr=0.01)}
+    optimizers = {
+        "embedder_optimizer": torch.optim.Adam(
+            layer.parameters(),
+            lr=0.01,
+        )
+    }
     losses = {"metric_loss": TripletMarginLoss()}
     how |= {"dataset": dataset, "collate_fn": igps.collate}
     MetricLossOnly(models, optimizers, 8, losses, **how).train()

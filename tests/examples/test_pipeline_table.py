@@ -28,10 +28,17 @@ CHECKS = {
     11: lambda found, space: found[1].ids == space["batch"].ids,
     12: lambda found, space: len(found) == 8 and found.ids[6:] == space["batch"].ids[:2],
     13: lambda found, space: tuple(found.shape) == (6, 2) and found.requires_grad,
-    14: lambda found, space: torch.allclose(found.sum(dim=1), torch.ones(6)),
+    14: lambda found, space: torch.allclose(
+        found.sum(dim=1),
+        torch.ones(6),
+    ),
     15: lambda found, space: not found.missing_keys,
     16: lambda found, space: bool((found.diagonal() == 0).all() and (found[:3, 3:] > 0).all()),
-    17: lambda found, space: torch.allclose(found, space["descriptor"](space["batch"]), atol=1e-6),
+    17: lambda found, space: torch.allclose(
+        found,
+        space["descriptor"](space["batch"]),
+        atol=1e-6,
+    ),
     18: lambda found, space: torch.allclose(
         found[1].float(), space["descriptor"](space["batch"]), atol=1e-4
     ),
@@ -68,7 +75,14 @@ def space(tmp_path_factory):
 
 def test_there_are_twenty_things_that_work_and_reasons_for_the_rest():
     assert len(ROWS) >= 20
-    numbers = [int(n) for n in re.findall(r"^\| (\d+) \|", PAGE, re.MULTILINE)]
+    numbers = [
+        int(n)
+        for n in re.findall(
+            r"^\| (\d+) \|",
+            PAGE,
+            re.MULTILINE,
+        )
+    ]
     assert numbers == list(range(1, 29))
     rest = [line for line in PAGE.splitlines() if line.startswith(("| 25", "| 26", "| 27", "| 28"))]
     for line in rest:

@@ -66,7 +66,12 @@ def names_in(gallery):
 
 
 def test_it_ranks_as_the_descriptor_does(dataset, root, tmp_path):
-    gallery, failures = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    gallery, failures = Gallery.build(
+        tmp_path / "g.igps",
+        dataset,
+        small_interior(),
+        n_workers=1,
+    )
     assert failures == []
     histograms = describe(dataset, small_interior())
     distances = chi_square(histograms[4:5], histograms)[0]
@@ -85,8 +90,16 @@ def test_it_ranks_as_the_descriptor_does(dataset, root, tmp_path):
 
 def test_adding_is_building(dataset, root, tmp_path):
     whole, _ = Gallery.build(tmp_path / "whole.igps", dataset, INTERIOR, n_workers=1)
-    added, _ = Gallery.build(tmp_path / "a.igps", dataset.subset([0, 1, 2]), INTERIOR, n_workers=1)
-    added.add(dataset.subset([2, 3, 4]), n_workers=1)
+    added, _ = Gallery.build(
+        tmp_path / "a.igps",
+        dataset.subset([0, 1, 2]),
+        INTERIOR,
+        n_workers=1,
+    )
+    added.add(
+        dataset.subset([2, 3, 4]),
+        n_workers=1,
+    )
     assert len(added) == 5
     added.add(dataset.subset([5]), n_workers=1)
     described = describe(dataset, small_interior())
@@ -103,7 +116,12 @@ def test_adding_is_building(dataset, root, tmp_path):
 def test_a_gallery_is_merged_into_another_by_its_rows(dataset, tmp_path):
     """As the page about galleries shows."""
     whole, _ = Gallery.build(tmp_path / "whole.igps", dataset, INTERIOR, n_workers=1)
-    one, _ = Gallery.build(tmp_path / "a.igps", dataset.subset([0, 1, 2]), INTERIOR, n_workers=1)
+    one, _ = Gallery.build(
+        tmp_path / "a.igps",
+        dataset.subset([0, 1, 2]),
+        INTERIOR,
+        n_workers=1,
+    )
     rest = dataset.subset([2, 3, 4, 5])
     other, _ = Gallery.build(tmp_path / "b.igps", rest, INTERIOR, n_workers=1)
     check_alike(one.path, one.about, other.about)
@@ -213,7 +231,12 @@ def test_rows_tell_size_class_and_what_labels_tell(root, tmp_path):
         table += ",".join(map(str, row)) + "\n"
     (root / "labels.csv").write_text(table)
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
-    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps",
+        dataset,
+        small_interior(),
+        n_workers=1,
+    )
     assert {"volume", "area", "age", "scanner"} <= gallery.columns.keys()
     meshes = {name: trimesh.load(root / name) for name, *_ in labelled}
     told = {row["name"]: row for row in gallery.rows(*gallery.columns)}
@@ -239,7 +262,12 @@ def test_sync_finds_what_is_new_changed_and_gone(root, tmp_path, monkeypatch):
     def now(folder=root):
         return SignatureDataset(folder, CONFIG, cache)
 
-    gallery, _ = Gallery.build(tmp_path / "g.igps", now(), small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps",
+        now(),
+        small_interior(),
+        n_workers=1,
+    )
     write_body(tmp_path / "elsewhere" / "o'clock.off", 1.0, 1.5)
     gallery.add(now(tmp_path / "elsewhere"), n_workers=1)
     version = gallery.table.table.version
@@ -269,7 +297,12 @@ def test_sync_finds_what_is_new_changed_and_gone(root, tmp_path, monkeypatch):
     found = sync(gallery, dataset, root, n_workers=1)
     assert found == (0, 0, [])
     assert gallery.remove("name = 'o''clock.off'") == 1
-    built, _ = Gallery.build(tmp_path / "built.igps", dataset, small_interior(), n_workers=1)
+    built, _ = Gallery.build(
+        tmp_path / "built.igps",
+        dataset,
+        small_interior(),
+        n_workers=1,
+    )
     described = describe(dataset, small_interior())
     assert gallery.nearest(described) == built.nearest(described)
     found = {one.label for one in built.nearest(described)[0]}
@@ -279,7 +312,12 @@ def test_sync_finds_what_is_new_changed_and_gone(root, tmp_path, monkeypatch):
 def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(root, tmp_path, monkeypatch):
     cache = tmp_path / "cache"
     dataset = SignatureDataset(root, CONFIG, cache)
-    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps",
+        dataset,
+        small_interior(),
+        n_workers=1,
+    )
     scan = os.scandir
     access = os.access
 
@@ -303,7 +341,12 @@ def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(root, tmp_path, m
 
 
 def test_it_opens_where_it_was_moved_to(dataset, tmp_path):
-    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps",
+        dataset,
+        small_interior(),
+        n_workers=1,
+    )
     described = describe(dataset, small_interior())
     expected = gallery.nearest(described)
     (tmp_path / "far").mkdir()
@@ -346,7 +389,12 @@ def test_sync_notices_a_table_of_names_that_was_edited(tmp_path, monkeypatch):
         reading = LoadOptions(bodies="labels", names=str(table))
         return SignatureDataset(tmp_path / "scans", CONFIG, tmp_path / "cache", reading=reading)
 
-    gallery, _ = Gallery.build(tmp_path / "g.igps", now(), small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps",
+        now(),
+        small_interior(),
+        n_workers=1,
+    )
     before = {row["part"]: row["volume"] for row in gallery.rows("part", "volume")}
     found = sync(gallery, now(), tmp_path / "scans", n_workers=1)
     assert found == (0, 0, [])
@@ -369,7 +417,12 @@ def test_a_column_with_a_dot_is_told_before_anything_is_described(root, tmp_path
 def test_a_column_with_a_name_of_the_engine_is_refused_before_it_spoils_the_gallery(
     root, dataset, tmp_path
 ):
-    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps",
+        dataset,
+        small_interior(),
+        n_workers=1,
+    )
     (root / "labels.csv").write_text("file,label,_rowid\nball/0.off,ball,3\n")
     words = r"labels.csv: .* do not begin with an underscore, got '_rowid'"
     changed = SignatureDataset(root, CONFIG, tmp_path / "cache")
@@ -382,7 +435,12 @@ def test_a_column_with_a_name_of_the_engine_is_refused_before_it_spoils_the_gall
 
 def test_a_condition_is_read_to_its_end(dataset, tmp_path):
     """Any text after a valid condition is an error, since it may have been meant to restrict the condition."""
-    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps",
+        dataset,
+        small_interior(),
+        n_workers=1,
+    )
     where = "name = 'ball/0.off'"
     described = describe(dataset, small_interior())[:1]
     words = "where: expected a condition on the columns id, name"
@@ -402,7 +460,12 @@ def test_a_folder_linked_twice_gives_each_body_once(root, tmp_path):
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     names = sorted(name for name in dataset.bodies.names if not name.startswith("zoo"))
     assert len(names) == 6 < len(dataset)
-    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps",
+        dataset,
+        small_interior(),
+        n_workers=1,
+    )
     assert names_in(gallery) == names
     version = gallery.table.table.version
     found = sync(gallery, dataset, root, n_workers=1)
@@ -433,9 +496,19 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path):
     def now():
         return SignatureDataset(tmp_path / "scans", CONFIG, tmp_path / "cache", reading=reading)
 
-    gallery, _ = Gallery.build(tmp_path / "g.igps", now(), small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps",
+        now(),
+        small_interior(),
+        n_workers=1,
+    )
     scan.write_bytes(b"being copied")
-    n_new, n_gone, (failure,) = sync(gallery, now(), tmp_path / "scans", n_workers=1)
+    n_new, n_gone, (failure,) = sync(
+        gallery,
+        now(),
+        tmp_path / "scans",
+        n_workers=1,
+    )
     assert n_new == 0
     assert n_gone == 0
     assert failure.id == "scan.nii.gz"
@@ -454,7 +527,12 @@ def test_numbers_stay_as_they_are_written_in_a_column_of_text(root, tmp_path):
     (root / "egg" / "labels.csv").write_text(table.format("03", "4"))
     balls = SignatureDataset(root / "ball", CONFIG, tmp_path / "cache")
     eggs = SignatureDataset(root / "egg", CONFIG, tmp_path / "cache")
-    gallery, _ = Gallery.build(tmp_path / "g.igps", balls, small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps",
+        balls,
+        small_interior(),
+        n_workers=1,
+    )
     gallery.add(eggs, n_workers=1)
     found = {row["age"] for row in gallery.rows("age")}
     assert found == {"old", "young", "03", "4", None}
@@ -469,11 +547,24 @@ def test_what_labels_tell_no_more_sync_empties(root, tmp_path):
     cache = tmp_path / "cache"
     table.write_text("file,label,age,scanner\nball/0.off,ball,41,A\negg/0.off,egg,3,B\n")
     dataset = SignatureDataset(root, CONFIG, cache)
-    gallery, _ = Gallery.build(tmp_path / "g", dataset, small_interior(), n_workers=1)
+    gallery, _ = Gallery.build(
+        tmp_path / "g",
+        dataset,
+        small_interior(),
+        n_workers=1,
+    )
     table.write_text("file,label,scanner\nball/0.off,ball,A\negg/0.off,egg,C\n")
-    found = sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
+    found = sync(
+        gallery,
+        SignatureDataset(root, CONFIG, cache),
+        root,
+        n_workers=1,
+    )
     assert found == (0, 0, [])
-    ball, egg = sorted(gallery.rows("name", "age", "scanner"), key=lambda row: row["name"])
+    ball, egg = sorted(
+        gallery.rows("name", "age", "scanner"),
+        key=lambda row: row["name"],
+    )
     assert ball == {"name": "ball/0.off", "age": None, "scanner": "A"}
     assert egg == {"name": "egg/0.off", "age": None, "scanner": "C"}
     version = gallery.table.table.version

@@ -39,7 +39,11 @@ def histograms(n, n_cells=300, seed=0):
 
 
 def units(n, width=16, seed=0):
-    found = torch.randn(n, width, generator=torch.Generator().manual_seed(seed))
+    found = torch.randn(
+        n,
+        width,
+        generator=torch.Generator().manual_seed(seed),
+    )
     return torch.nn.functional.normalize(found, dim=1)
 
 
@@ -74,7 +78,14 @@ def recall(table, asked, rows, distance, **options):
     exact = search(asked, rows, top=10, distance=distance).indices.tolist()
     n_found = 0
     for one, nearest in zip(asked, exact, strict=True):
-        found = numbers(table.nearest(one[None], distance, top=10, **options))
+        found = numbers(
+            table.nearest(
+                one[None],
+                distance,
+                top=10,
+                **options,
+            )
+        )
         n_found += len(set(found) & set(nearest))
     return n_found / (10 * len(asked))
 
@@ -85,9 +96,18 @@ def test_few_are_compared_one_by_one(tmp_path, searched_by):
     table = written(tmp_path / "g.igps", rows, searched_by)
     expected = search(rows[:5], rows, top=7)
     for i in range(5):
-        found = table.nearest(rows[i : i + 1], chi_square, top=7)
+        found = table.nearest(
+            rows[i : i + 1],
+            chi_square,
+            top=7,
+        )
         assert numbers(found) == expected.indices[i].tolist()
-        assert_close(found[1], expected.distances[i], rtol=1e-6, atol=1e-7)
+        assert_close(
+            found[1],
+            expected.distances[i],
+            rtol=1e-6,
+            atol=1e-7,
+        )
         assert torch.equal(found[2], rows[expected.indices[i]])
     assert {name: found[0][0][name] for name in told(4)} == told(4)
     assert len(table) == 90
@@ -100,7 +120,12 @@ def test_the_nearest_of_many_are_those_of_all(tmp_path):
     assert recall(table, asked, rows, chi_square, candidates=200) >= 0.98
     exact = search(asked[:3], rows, top=10)
     for i in range(3):
-        found = table.nearest(asked[i : i + 1], chi_square, top=10, exact=True)
+        found = table.nearest(
+            asked[i : i + 1],
+            chi_square,
+            top=10,
+            exact=True,
+        )
         assert numbers(found) == exact.indices[i].tolist()
         expected = exact.distances[i]
         assert_close(found[1], expected, rtol=1e-5, atol=1e-6)
@@ -124,13 +149,25 @@ def test_a_condition_keeps_what_numpy_keeps(tmp_path):
         order = torch.sort(1 - rows[left] @ query, stable=True).indices[:10]
         expected = left[order.numpy()].tolist()
         for exact in (False, True):
-            found = table.nearest(query[None], cosine, top=10, where=where, exact=exact)
+            found = table.nearest(
+                query[None],
+                cosine,
+                top=10,
+                where=where,
+                exact=exact,
+            )
             assert numbers(found) == expected, where
     words = r"where: expected a condition on the columns id, name, .* age, got"
     for wrong in ("weight > 3", "volume >", "volume > 'much' AND"):
         for exact in (False, True):
             with pytest.raises(ValueError, match=words):
-                table.nearest(rows[:1], cosine, top=1, where=wrong, exact=exact)
+                table.nearest(
+                    rows[:1],
+                    cosine,
+                    top=1,
+                    where=wrong,
+                    exact=exact,
+                )
 
 
 def test_vectors_of_any_length_are_searched(tmp_path):
@@ -164,11 +201,19 @@ def test_rows_are_added_replaced_and_removed(tmp_path):
     assert "short" not in table.table.schema.names
     # The second addition makes the table large enough for short vectors and an index
     for start in (2400, 3600):
-        table.add(rows[start : start + 1200], [told(start + i) for i in range(1200)], {"site": str})
+        table.add(
+            rows[start : start + 1200],
+            [told(start + i) for i in range(1200)],
+            {"site": str},
+        )
     assert {"id", "site", "short"} <= {index.columns[0] for index in table.table.list_indices()}
     assert table.columns["site"] is str
     changed = rows[4800:]
-    table.add(changed, [{**told(i, "b"), "site": "A"} for i in range(200)], {"site": str})
+    table.add(
+        changed,
+        [{**told(i, "b"), "site": "A"} for i in range(200)],
+        {"site": str},
+    )
     assert len(table) == 4800
     assert len(table.table.search().where("site = 'A'").to_list()) == 200
     with table.changing() as engine:
@@ -176,10 +221,18 @@ def test_rows_are_added_replaced_and_removed(tmp_path):
     now = torch.cat([changed[100:], rows[200:4800]])
     for query in now[::600]:
         expected = search(query[None], now, top=6, distance=cosine).indices[0] + 100
-        found = BodyTable(table.path).nearest(query[None], cosine, top=6)
+        found = BodyTable(table.path).nearest(
+            query[None],
+            cosine,
+            top=6,
+        )
         assert numbers(found) == expected.tolist()
     with pytest.raises(ValueError, match=r"age: expected numbers as in .*g\.igps, got text"):
-        table.add(rows[:1], [{**told(0), "age": "old"}], {"age": str})
+        table.add(
+            rows[:1],
+            [{**told(0), "age": "old"}],
+            {"age": str},
+        )
 
 
 def test_weighted_numbers_decide_which_rows_are_candidates(tmp_path):
@@ -187,7 +240,10 @@ def test_weighted_numbers_decide_which_rows_are_candidates(tmp_path):
     rows = units(4500, 40)
 
     def distance(queries, gallery):
-        return torch.cdist(queries[:, 38:], gallery[:, 38:])
+        return torch.cdist(
+            queries[:, 38:],
+            gallery[:, 38:],
+        )
 
     def weights(width):
         return [0.1] * (width - 2) + [9.0] * 2
@@ -195,8 +251,26 @@ def test_weighted_numbers_decide_which_rows_are_candidates(tmp_path):
     plain = written(tmp_path / "plain.igps", rows, "cosine")
     path = tmp_path / "weighted.igps"
     write(path, ABOUT, "cosine", batches(rows), FURTHER, weights=weights)
-    assert recall(plain, rows[:20], rows, distance, candidates=60) < 0.5
-    assert recall(BodyTable(path), rows[:20], rows, distance, candidates=60) >= 0.98
+    assert (
+        recall(
+            plain,
+            rows[:20],
+            rows,
+            distance,
+            candidates=60,
+        )
+        < 0.5
+    )
+    assert (
+        recall(
+            BodyTable(path),
+            rows[:20],
+            rows,
+            distance,
+            candidates=60,
+        )
+        >= 0.98
+    )
 
 
 def test_versions_are_those_of_the_engine(tmp_path):
@@ -209,7 +283,13 @@ def test_versions_are_those_of_the_engine(tmp_path):
     lancedb.connect(table.path).open_table("bodies").restore(first)
     restored = BodyTable(table.path)
     assert len(restored) == 4500
-    found = numbers(restored.nearest(rows[29:30], cosine, top=1))
+    found = numbers(
+        restored.nearest(
+            rows[29:30],
+            cosine,
+            top=1,
+        )
+    )
     assert found == [29]
 
 
@@ -221,9 +301,19 @@ def test_a_gallery_lies_in_an_object_store(tmp_path):
     write(place, ABOUT, "cosine", batches(rows), FURTHER)
     assert is_gallery(place)
     table = BodyTable(place)
-    table.add(rows[:10], [told(i, "b") for i in range(10)], {})
+    table.add(
+        rows[:10],
+        [told(i, "b") for i in range(10)],
+        {},
+    )
     assert len(BodyTable(place)) == 4500
-    found = numbers(BodyTable(place).nearest(rows[7:8], cosine, top=1))
+    found = numbers(
+        BodyTable(place).nearest(
+            rows[7:8],
+            cosine,
+            top=1,
+        )
+    )
     assert found == [7]
 
 
@@ -243,7 +333,11 @@ def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path):
     with pytest.raises(ValueError, match=words + r"\(5,\)"):
         table.nearest(units(1, 5), cosine, top=1)
     with pytest.raises(ValueError, match=words + r"\(4, 4\)"):
-        table.add(units(1).reshape(1, 4, 4), [told(0)], {})
+        table.add(
+            units(1).reshape(1, 4, 4),
+            [told(0)],
+            {},
+        )
     with pytest.raises(ValueError, match="expected finite numbers"):
         table.add(units(1) / 0, [told(0)], {})
     with pytest.raises(ValueError, match="at least one for the gallery"):
@@ -260,12 +354,18 @@ def test_a_strangers_gallery_runs_nothing(tmp_path):
     damages = (("embedding_functions", b"[]"), ("gallery", b"{"), ("gallery", b"[1]"))
     for number, (name, value) in enumerate(damages):
         table = written(tmp_path / f"{number}.igps", units(3), "cosine")
-        head = {**table.table.to_arrow().schema.metadata, name.encode(): value}
+        head = {
+            **table.table.to_arrow().schema.metadata,
+            name.encode(): value,
+        }
         with_head(table, head)
         with pytest.raises(ValueError, match=r"\d\.igps: the gallery is damaged\. Restore"):
             BodyTable(table.path)
     table = written(tmp_path / "map.igps", units(3), "cosine")
-    lancedb.connect(table.path).create_table("map-x", pa.table({"arrays": [b"\x80\x04N."]}))
+    lancedb.connect(table.path).create_table(
+        "map-x",
+        pa.table({"arrays": [b"\x80\x04N."]}),
+    )
     head = table.table.to_arrow().schema.metadata[b"gallery"]
     with_head(table, {b"gallery": head.replace(b'"map": null', b'"map": "map-x"')})
     with pytest.raises(ValueError, match=r"map\.igps: the gallery is damaged.*pickle"):
@@ -284,7 +384,13 @@ def test_no_damaged_file_gives_a_wrong_answer(tmp_path, how):
     rows = units(4500)
     path = tmp_path / "g.igps"
     written(path, rows, "cosine")
-    right = numbers(BodyTable(path).nearest(rows[:1], cosine, top=3))
+    right = numbers(
+        BodyTable(path).nearest(
+            rows[:1],
+            cosine,
+            top=3,
+        )
+    )
     files = [file for file in path.rglob("*") if file.is_file() and file.name != "lock"]
     # One file of each kind in each folder
     chosen = {(file.parent, file.suffix): file for file in files}
@@ -298,7 +404,16 @@ def test_no_damaged_file_gives_a_wrong_answer(tmp_path, how):
             file.write_bytes(content[:n_bytes])
         error = ""
         try:
-            assert numbers(BodyTable(path).nearest(rows[:1], cosine, top=3)) == right, file
+            assert (
+                numbers(
+                    BodyTable(path).nearest(
+                        rows[:1],
+                        cosine,
+                        top=3,
+                    )
+                )
+                == right
+            ), file
         except (ValueError, FileNotFoundError) as refusal:
             error = str(refusal)
             n_refused += 1
@@ -306,7 +421,13 @@ def test_no_damaged_file_gives_a_wrong_answer(tmp_path, how):
         assert "\n" not in error
         file.write_bytes(content)
     assert n_refused >= 3
-    found = numbers(BodyTable(path).nearest(rows[:1], cosine, top=3))
+    found = numbers(
+        BodyTable(path).nearest(
+            rows[:1],
+            cosine,
+            top=3,
+        )
+    )
     assert found == right
 
 
@@ -323,7 +444,11 @@ def test_several_processes_read_while_one_adds(tmp_path):
     before = _answers(table.path)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         futures = [pool.submit(_answers, table.path) for _ in range(6)]
-        table.add(rows[1300:], [told(i) for i in range(1300, 1500)], {})
+        table.add(
+            rows[1300:],
+            [told(i) for i in range(1300, 1500)],
+            {},
+        )
         after = _answers(table.path)
         for future in futures:
             assert future.result() in (before, after)
@@ -359,12 +484,21 @@ def killed_writers(folder, n_kills, longest=0.25):
     written(folder, units(50, seed=1), "cosine", mark="still")
     wrong = 0
     generator = random.Random(0)
-    words = _WRITER.format(tests=str(Path(__file__).parent), folder=str(folder))
+    words = _WRITER.format(
+        tests=str(Path(__file__).parent),
+        folder=str(folder),
+    )
     for _ in range(n_kills):
         both = []
         for who in ("1", "2"):
             command = [sys.executable, "-c", words, who]
-            both.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+            both.append(
+                subprocess.Popen(
+                    command,
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                )
+            )
         for child in both:
             child.stdout.readline()
         for child in both:
@@ -404,7 +538,10 @@ def is_whole_of_writer(who, rows):
     is_updated = classes == {mark}
     is_new = classes <= {"odd", None} and len(own) == 40
     expected = units(40, seed=int(mark.partition("-")[2]))[: len(own)]
-    is_equal = torch.equal(torch.stack([values for _, values in own]), expected)
+    is_equal = torch.equal(
+        torch.stack([values for _, values in own]),
+        expected,
+    )
     return (is_updated or is_new) and is_equal
 
 
@@ -418,7 +555,15 @@ def test_kills_of_two_writers_leave_whole_changes(tmp_path):
 def test_is_whole_detects_a_change_stored_in_part(tmp_path):
     """The check of the test above can fail."""
     table = written(tmp_path / "g.igps", units(50, seed=1), "cosine", mark="still")
-    table.add(units(40, seed=3), [told(1000 + i, "1-3") for i in range(40)], {})
+    table.add(
+        units(40, seed=3),
+        [told(1000 + i, "1-3") for i in range(40)],
+        {},
+    )
     assert is_whole(table)
-    table.add(units(7, seed=3), [told(1000 + i, "1-4") for i in range(7)], {})
+    table.add(
+        units(7, seed=3),
+        [told(1000 + i, "1-4") for i in range(7)],
+        {},
+    )
     assert not is_whole(table)

@@ -27,7 +27,11 @@ def dataset(tmp_path_factory):
     root = tmp_path_factory.mktemp("fitting")
     for label, height in HEIGHTS.items():
         for i in range(4):
-            write_egg(root / "eggs" / label / f"{i}.off", height * (1 + 0.04 * i), subdivisions=2)
+            write_egg(
+                root / "eggs" / label / f"{i}.off",
+                height * (1 + 0.04 * i),
+                subdivisions=2,
+            )
     found = igps.SignatureDataset(root / "eggs", CONFIG, root / "cache")
     assert found.precompute(n_workers=1, progress=False) == []
     return found
@@ -79,12 +83,24 @@ def test_held_out_scores_are_of_what_was_held_out(dataset):
         hits += (head.predict(cells[out]) == labels[out]).tolist()
         sure += head.probabilities(cells[out]).max(dim=1).values.tolist()
         new = labels == number  # one class is left out of each
-        less = ClassifierHead().fit(cells[~out & ~new], labels[~out & ~new], calibrate=False)
-        areas.append(roc_auc_score(new[out], less.strangeness(cells[out])))
+        less = ClassifierHead().fit(
+            cells[~out & ~new],
+            labels[~out & ~new],
+            calibrate=False,
+        )
+        areas.append(
+            roc_auc_score(
+                new[out],
+                less.strangeness(cells[out]),
+            )
+        )
     scores = model.card["held_out_scores"]
     assert scores["accuracy"] == pytest.approx(sum(hits) / 16)
     # Of each bin of a tenth, how far what was expected and what was right are apart
-    gaps = np.bincount(np.ceil(np.array(sure) * 10).astype(int), np.subtract(sure, hits))
+    gaps = np.bincount(
+        np.ceil(np.array(sure) * 10).astype(int),
+        np.subtract(sure, hits),
+    )
     error = np.abs(gaps).sum() / 16
     assert scores["calibration_error"] == pytest.approx(error, abs=1e-5)
     assert scores["unknown_auc"] == pytest.approx(np.mean(areas))
@@ -129,7 +145,11 @@ def test_too_little_to_fit_to_is_said(dataset):
     with pytest.raises(ValueError, match=words):
         igps.fit(dataset.subset(range(4)), small_interior())
     with pytest.raises(ValueError, match="classes: expected at least 4"):
-        igps.fit(dataset.subset(range(8)), small_interior(), goal="new")
+        igps.fit(
+            dataset.subset(range(8)),
+            small_interior(),
+            goal="new",
+        )
     with pytest.raises(ValueError, match="goal: expected one of known, new, got 'both'"):
         igps.fit(dataset, small_interior(), goal="both")
     words = "head: expected one of auto, classifier, linear, whitened, as_is, got 'best'"
@@ -139,13 +159,19 @@ def test_too_little_to_fit_to_is_said(dataset):
         igps.fit(dataset, Below(), head="whitened")
 
 
-@pytest.mark.parametrize("sizes", [(5, 5, 5, 1), (5, 1, 1), (2, 2)])
+@pytest.mark.parametrize(
+    "sizes",
+    [(5, 5, 5, 1), (5, 1, 1), (2, 2)],
+)
 def test_no_sizes_of_classes_are_too_uneven(dataset, sizes):
     """Folds may lack two training bodies of any class, or hold out no class that the classifier knows."""
     labels = []
     for name, n in zip(HEIGHTS, sizes, strict=False):
         labels += [name] * n
-    bodies = replace(dataset.bodies.subset(range(len(labels))), labels=tuple(labels))
+    bodies = replace(
+        dataset.bodies.subset(range(len(labels))),
+        labels=tuple(labels),
+    )
     again = igps.SignatureDataset(bodies, dataset.config, dataset.pipeline.cache_dir)
     for head in ("auto", "classifier", "whitened"):
         model = igps.fit(again, small_interior(), head=head)
@@ -188,7 +214,14 @@ def test_plain_numbers_are_left_out_if_a_body_has_none(dataset):
 
 
 def test_balanced_accuracy_and_area_count_small_classes_as_much_as_large_ones():
-    probabilities = torch.tensor([[0.9, 0.1], [0.8, 0.2], [0.6, 0.4], [0.7, 0.3]])
+    probabilities = torch.tensor(
+        [
+            [0.9, 0.1],
+            [0.8, 0.2],
+            [0.6, 0.4],
+            [0.7, 0.3],
+        ]
+    )
     labels = torch.tensor([3, 3, 3, 8])
     scores = classification_scores(probabilities, labels, torch.tensor([3, 8]))
     assert scores["accuracy"] == 0.75
@@ -200,7 +233,10 @@ def test_balanced_accuracy_and_area_count_small_classes_as_much_as_large_ones():
 def test_what_tells_the_classes_without_form_is_said(dataset):
     assert shortcuts(dataset) == []
     scanners = ["A" if label in ("flat", "round") else label for label in dataset.bodies.labels]
-    columns = {"scanner": tuple(scanners), "age": tuple(map(str, range(16)))}
+    columns = {
+        "scanner": tuple(scanners),
+        "age": tuple(map(str, range(16))),
+    }
     told = copy.copy(dataset)
     told.bodies = replace(dataset.bodies, columns=columns)
     assert shortcuts(told) == []  # two of four classes have one scanner

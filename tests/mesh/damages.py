@@ -81,7 +81,10 @@ def halves(mesh, seed=0):
     points = mesh.vertices - centre
     axis = np.linalg.eigh(points.T @ points)[1][:, -1]
     body = manifold3d.Manifold(
-        manifold3d.Mesh64(np.ascontiguousarray(points), mesh.faces.astype(np.uint64))
+        manifold3d.Mesh64(
+            np.ascontiguousarray(points),
+            mesh.faces.astype(np.uint64),
+        )
     )
     if body.status() != manifold3d.Error.NoError:
         raise MeshError(
@@ -133,17 +136,26 @@ def _with_holes(vertices, faces, generator):
     area = face_areas(vertices, faces)
     per_patch = _MISSING / _N_PATCHES * area.sum()
     pairs, _ = undirected_edges(faces, len(vertices))
-    length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+    length = np.linalg.norm(
+        vertices[pairs[:, 0]] - vertices[pairs[:, 1]],
+        axis=1,
+    )
     graph = sparse.csr_array(
         (np.maximum(length, 1e-300), tuple(pairs.T.astype(np.int32))), shape=(len(vertices),) * 2
     )
     is_kept = np.ones(len(faces), dtype=bool)
     for _ in range(_N_PATCHES):
-        middle = generator.choice(len(area), p=area * is_kept / (area * is_kept).sum())
+        middle = generator.choice(
+            len(area),
+            p=area * is_kept / (area * is_kept).sum(),
+        )
         away = (
             dijkstra(graph, directed=False, indices=faces[middle]).mean(axis=0)[faces].mean(axis=1)
         )
-        order = np.argsort(np.where(is_kept, away, np.inf), kind="stable")
+        order = np.argsort(
+            np.where(is_kept, away, np.inf),
+            kind="stable",
+        )
         is_kept[order[: max(int((np.cumsum(area[order]) <= per_patch).sum()), 1)]] = False
     return compact(vertices, faces[is_kept])
 
@@ -167,7 +179,10 @@ def _with_fins(vertices, faces, generator):
     b = faces[face, (corner + 1) % 3]
     normals = unit(area_vectors(vertices, faces)[face])
     tips = (vertices[a] + vertices[b]) / 2 + 0.01 * diagonal(vertices) * normals
-    stands = np.stack([a, b, len(vertices) + np.arange(_N_FINS)], axis=1)
+    stands = np.stack(
+        [a, b, len(vertices) + np.arange(_N_FINS)],
+        axis=1,
+    )
     twice = faces[generator.permutation(len(faces))[: max(round(_DOUBLED * len(faces)), 1)]]
     return np.vstack([vertices, tips]), np.vstack([faces, stands, twice])
 
@@ -186,15 +201,32 @@ def _with_parts(vertices, faces, generator, mesh):
     speck = np.sqrt(1e-3 * mesh.area / (4 * np.pi))
     n = len(vertices)
     return (
-        np.vstack([vertices, centre + radius * ball, place + speck * ball]),
-        np.vstack([faces, n + triangles, n + len(ball) + triangles]),
+        np.vstack(
+            [
+                vertices,
+                centre + radius * ball,
+                place + speck * ball,
+            ]
+        ),
+        np.vstack(
+            [
+                faces,
+                n + triangles,
+                n + len(ball) + triangles,
+            ]
+        ),
     )
 
 
 def _deepest_ball(mesh):
     """Return the interior sample farthest from vertices and face centres, and half that distance."""
     points = interior_samples(mesh, min_samples=1)
-    surface = np.vstack([mesh.vertices, mesh.vertices[mesh.faces].mean(axis=1)])
+    surface = np.vstack(
+        [
+            mesh.vertices,
+            mesh.vertices[mesh.faces].mean(axis=1),
+        ]
+    )
     away, _ = cKDTree(surface).query(points)
     deepest = int(np.argmax(away))
     return points[deepest], float(away[deepest]) / 2

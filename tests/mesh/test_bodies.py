@@ -83,7 +83,10 @@ def test_an_object_of_objects_is_one_body_turned_and_mirrored_as_the_plan_says(t
     volumes = np.linalg.det(corners - [10, 20, 30]).reshape(2, 4).sum(axis=1) / 6
     assert_allclose(volumes, [1 / 6, 1 / 3])
     # A quarter turn about z takes x to y: the second reaches from 20 back to 18.
-    found = [corners[4:, :, 1].min(), corners[4:, :, 1].max()]
+    found = [
+        corners[4:, :, 1].min(),
+        corners[4:, :, 1].max(),
+    ]
     assert_allclose(found, [18, 20])
 
 
@@ -157,7 +160,10 @@ def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path):
     text += "".join("f {} {} {}\n".format(*face) for face in (whole.faces + 1).tolist())
     (tmp_path / "boxes.obj").write_text(text)
     assert parts(tmp_path / "boxes.obj", PIECES) == ["piece 1", "piece 2", "piece 3"]
-    np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((20, 3)))
+    np.savetxt(
+        tmp_path / "cloud.xyz",
+        np.random.default_rng(0).random((20, 3)),
+    )
     assert parts(tmp_path / "cloud.xyz", PIECES) == [None]
 
 
@@ -200,15 +206,28 @@ def test_what_a_format_does_not_have_is_its_usual_way(tmp_path):
         assert parts(tmp_path / "box.stl", LoadOptions(bodies=bodies)) == [None]
 
 
-@pytest.mark.parametrize(("unit", "scale"), [(".MILLI.", 1.0), ("$", 1000.0)])
+@pytest.mark.parametrize(
+    ("unit", "scale"),
+    [(".MILLI.", 1.0), ("$", 1000.0)],
+)
 def test_solids_of_a_step_file_are_bodies_in_millimetres(unit, scale, tmp_path):
     """A part of one solid, and one of two; the file is in millimetres or in metres."""
     path = tmp_path / "parts.step"
-    pair = [((5, 0, 0), (6, 1, 1)), ((10, 0, 0), (12, 2, 2))]
-    write_step(path, {"lid": [((0, 0, 0), (1, 2, 3))], "pair": pair}, unit)
+    pair = [
+        ((5, 0, 0), (6, 1, 1)),
+        ((10, 0, 0), (12, 2, 2)),
+    ]
+    write_step(
+        path,
+        {"lid": [((0, 0, 0), (1, 2, 3))], "pair": pair},
+        unit,
+    )
     bodies = {body.name.partition("#")[2]: body for body in load_bodies(path, OBJECTS)}
     volumes = {name: body.volume / scale**3 for name, body in bodies.items()}
-    expected = pytest.approx({"lid": 6, "pair": 1, "pair (2)": 8}, rel=1e-6)
+    expected = pytest.approx(
+        {"lid": 6, "pair": 1, "pair (2)": 8},
+        rel=1e-6,
+    )
     assert volumes == expected
     assert {body.unit for body in bodies.values()} == {"mm"}
     found = bodies["pair (2)"].vertices.max(axis=0) / scale
@@ -226,7 +245,11 @@ def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path
     labels[8:14, 2:14, 2:10] = 5
     labels[18, 18, 2:9] = 9
     nibabel.save(
-        nibabel.Nifti1Image(labels, np.diag([1.0, 1.0, 2.0, 1.0])), tmp_path / "organs.nii.gz"
+        nibabel.Nifti1Image(
+            labels,
+            np.diag([1.0, 1.0, 2.0, 1.0]),
+        ),
+        tmp_path / "organs.nii.gz",
     )
     (tmp_path / "names.csv").write_text("label,name\n1,left\n5,right\n9,speck\n")
     path = tmp_path / "organs.nii.gz"
@@ -253,6 +276,9 @@ def test_chains_of_a_structure_are_bodies_in_angstrom(tmp_path):
     assert parts(path, LoadOptions()) == ["chain A", "chain B"]
     for body in load_bodies(path):
         assert body.unit == "Å"
-        expected = pytest.approx(4 / 3 * np.pi * 1.39**3, rel=0.05)
+        expected = pytest.approx(
+            4 / 3 * np.pi * 1.39**3,
+            rel=0.05,
+        )
         assert body.volume == expected
     assert parts(path, LoadOptions(bodies="models")) == ["model"]

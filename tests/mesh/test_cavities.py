@@ -30,7 +30,12 @@ Surface = tuple[np.ndarray, np.ndarray]
 
 
 def joined(*parts):
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    starts = np.cumsum(
+        [
+            0,
+            *(len(vertices) for vertices, _ in parts),
+        ]
+    )
     faces = [faces + start for (_, faces), start in zip(parts, starts, strict=False)]
     return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
@@ -41,11 +46,20 @@ def ball(radius, at=0.0, *, inwards=False):
 
 
 def test_a_cavity_that_is_turned_inwards_is_part_of_the_body_as_it_is():
-    hollow = mend(*joined(ball(1), ball(0.5, inwards=True)), cavities="keep")
+    hollow = mend(
+        *joined(ball(1), ball(0.5, inwards=True)),
+        cavities="keep",
+    )
     assert hollow.notes == ()
-    expected = pytest.approx((1 - 0.5**3) * BALL.volume, rel=1e-12)
+    expected = pytest.approx(
+        (1 - 0.5**3) * BALL.volume,
+        rel=1e-12,
+    )
     assert hollow.volume == expected
-    expected = pytest.approx((1 + 0.5**2) * BALL.area, rel=1e-12)
+    expected = pytest.approx(
+        (1 + 0.5**2) * BALL.area,
+        rel=1e-12,
+    )
     assert hollow.area == expected
     assert hollow.genus == 0
 
@@ -58,9 +72,17 @@ def test_filled_it_is_the_ball(inwards):
 
 
 def test_a_hidden_part_that_is_turned_outwards_is_turned_for_a_cavity_and_kept_once():
-    surface = joined(ball(1), ball(0.5), ball(0.2), ball(0.1, 0.75))
+    surface = joined(
+        ball(1),
+        ball(0.5),
+        ball(0.2),
+        ball(0.1, 0.75),
+    )
     hollow = mend(*surface, cavities="keep")
-    expected = pytest.approx((1 - 0.5**3 - 0.1**3) * BALL.volume, rel=1e-12)
+    expected = pytest.approx(
+        (1 - 0.5**3 - 0.1**3) * BALL.volume,
+        rel=1e-12,
+    )
     assert hollow.volume == expected
     assert hollow.notes == (
         "turned the surface of a cavity towards the inside",
@@ -72,8 +94,14 @@ def test_a_hidden_part_that_is_turned_outwards_is_turned_for_a_cavity_and_kept_o
 
 @pytest.mark.parametrize("inwards", [False, True])
 def test_a_cavity_is_one_though_the_outer_surface_is_inside_out(inwards):
-    hollow = mend(*joined(ball(1, inwards=True), ball(0.5, inwards=inwards)), cavities="keep")
-    expected = pytest.approx((1 - 0.5**3) * BALL.volume, rel=1e-12)
+    hollow = mend(
+        *joined(ball(1, inwards=True), ball(0.5, inwards=inwards)),
+        cavities="keep",
+    )
+    expected = pytest.approx(
+        (1 - 0.5**3) * BALL.volume,
+        rel=1e-12,
+    )
     assert hollow.volume == expected
 
 
@@ -83,7 +111,10 @@ def test_a_cavity_is_one_though_the_outer_surface_is_inside_out(inwards):
         ball(0.5),
         ball(0.5, 3.0, inwards=True),
         ball(0.5, 0.8, inwards=True),
-        joined(ball(0.5, inwards=True), ball(0.2, inwards=True)),
+        joined(
+            ball(0.5, inwards=True),
+            ball(0.2, inwards=True),
+        ),
     ],
     ids=["turned outwards", "outside", "across", "in another"],
 )
@@ -97,7 +128,10 @@ def test_what_is_no_cavity_is_refused(other):
 
 
 def test_samples_lie_in_the_wall_and_on_all_surfaces():
-    hollow = Mesh(*joined(ball(1), ball(0.7, inwards=True)), cavities=True)
+    hollow = Mesh(
+        *joined(ball(1), ball(0.7, inwards=True)),
+        cavities=True,
+    )
     radii = norm(interior_samples(hollow, 32, 1000), axis=1)
     assert radii.min() > 0.69
     assert radii.max() < 1
@@ -120,7 +154,11 @@ def test_eigenfunctions_of_the_outside_go_on_through_the_wall():
     """The first three of a ball extend to linear functions in the wall: the sum of squares is 3 |x|² / 4π."""
     config = SignatureConfig(n_eigenpairs=30, accuracy=None)
     hollow = compute_signature(
-        Mesh(*joined(ball(1), ball(0.7, inwards=True)), cavities=True), config
+        Mesh(
+            *joined(ball(1), ball(0.7, inwards=True)),
+            cavities=True,
+        ),
+        config,
     )
     full = compute_signature(Mesh(*ball(1)), config)
     assert_allclose(hollow.eigenvalues, full.eigenvalues, rtol=1e-6)
@@ -132,7 +170,10 @@ def test_eigenfunctions_of_the_outside_go_on_through_the_wall():
 
 def test_the_outer_surface_has_vertices_enough_whatever_the_cavity_has():
     box = trimesh.creation.box((4, 4, 4))
-    surface = joined((np.asarray(box.vertices), np.asarray(box.faces)), ball(1, inwards=True))
+    surface = joined(
+        (np.asarray(box.vertices), np.asarray(box.faces)),
+        ball(1, inwards=True),
+    )
     hollow = mend(*surface, least_vertices=100, cavities="keep")
     assert hollow.outer()[1].sum() >= 100
     assert hollow.volume == pytest.approx(64 - BALL.volume, rel=1e-9)
@@ -143,7 +184,10 @@ def test_a_file_is_read_with_its_cavities_where_they_are_kept(tmp_path):
     vertices, faces = joined(ball(1), ball(0.5, inwards=True))
     trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "hollow.off")
     kept = load_mesh(tmp_path / "hollow.off", LoadOptions(cavities="keep"))
-    expected = pytest.approx((1 - 0.5**3) * BALL.volume, rel=1e-6)
+    expected = pytest.approx(
+        (1 - 0.5**3) * BALL.volume,
+        rel=1e-6,
+    )
     assert kept.volume == expected
     expected = pytest.approx(BALL.volume, rel=1e-6)
     assert load_mesh(tmp_path / "hollow.off").volume == expected
@@ -155,13 +199,19 @@ def test_a_file_is_read_with_its_cavities_where_they_are_kept(tmp_path):
 
 
 def test_a_label_keeps_its_cavities():
-    radius = norm(np.indices((40, 40, 40)) - 19.5, axis=0)
+    radius = norm(
+        np.indices((40, 40, 40)) - 19.5,
+        axis=0,
+    )
     mask = (radius < 16) & (radius > 7)
     mask[19, 19, 4] = False  # a voxel of noise is no cavity
     vertices, faces, notes = voxel_surface(mask, cavities=True)
     hollow = Mesh(vertices, faces, cavities=True)
     assert hollow.volume == pytest.approx(np.count_nonzero(mask), rel=0.01)
-    expected = pytest.approx(4 * np.pi * (16**2 + 7**2), rel=0.04)
+    expected = pytest.approx(
+        4 * np.pi * (16**2 + 7**2),
+        rel=0.04,
+    )
     assert hollow.area == expected
     full = voxel_surface(mask)
     found = signed_volume(*full[:2])
@@ -192,11 +242,19 @@ def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path):
     )
     radius = np.sqrt(x**2 + y**2 + z**2)
     labels = np.select(
-        [radius < 8, radius < 15, (np.hypot(x, y) - 22) ** 2 + z**2 < 5**2], [2, 1, 3]
+        [
+            radius < 8,
+            radius < 15,
+            (np.hypot(x, y) - 22) ** 2 + z**2 < 5**2,
+        ],
+        [2, 1, 3],
     )
     for name, of in (("x", labels), ("full", labels * (labels != 2) + (labels == 2))):
         nibabel.save(
-            nibabel.Nifti1Image(of.astype(np.uint8), np.diag([1.0, 1, 1.5, 1])),
+            nibabel.Nifti1Image(
+                of.astype(np.uint8),
+                np.diag([1.0, 1, 1.5, 1]),
+            ),
             tmp_path / f"{name}.nii",
         )
     ball = load_mesh(tmp_path / "full.nii", part="1")
@@ -211,15 +269,24 @@ def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path):
         assert kept.volume == pytest.approx(
             volume, rel=0.04
         )  # as well as voxels of this size tell it
-        assert kept.volume == pytest.approx(1.5 * np.count_nonzero(labels == int(part)), rel=1e-3)
+        assert kept.volume == pytest.approx(
+            1.5 * np.count_nonzero(labels == int(part)),
+            rel=1e-3,
+        )
         assert filled.genus == (part == "3")
         of = ball if part == "1" else kept
         assert_array_equal(filled.vertices, of.vertices)
         assert_array_equal(filled.faces, of.faces)
     wall = load_mesh(tmp_path / "x.nii", LoadOptions(cavities="keep"), part="1")
-    assert wall.area == pytest.approx(4 * np.pi * (15**2 + 8**2), rel=0.03)
+    assert wall.area == pytest.approx(
+        4 * np.pi * (15**2 + 8**2),
+        rel=0.03,
+    )
     signature = compute_signature(wall, SignatureConfig(n_eigenpairs=30))
-    from_middle = norm(signature.interior.points - [28, 28, 20.25], axis=1)
+    from_middle = norm(
+        signature.interior.points - [28, 28, 20.25],
+        axis=1,
+    )
     assert from_middle.min() > 7
     assert from_middle.max() < 16
     assert signature.volume == pytest.approx(wall.volume)
@@ -227,7 +294,10 @@ def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path):
 
 def test_a_piece_of_a_label_in_its_cavity_is_told():
     """A seed in its shell was left out without a word."""
-    radius = norm(np.indices((41, 41, 41)) - 20.0, axis=0)
+    radius = norm(
+        np.indices((41, 41, 41)) - 20.0,
+        axis=0,
+    )
     shell = (radius > 14) & (radius < 18)
     seed = radius < 8
     vertices, faces, notes = voxel_surface(shell | seed, cavities=True)
@@ -241,7 +311,10 @@ def test_a_piece_of_a_label_in_its_cavity_is_told():
 def test_the_larger_the_cavity_the_farther_from_the_ball():
     bodies = [Mesh(*ball(1))]
     bodies += [
-        Mesh(*joined(ball(1), ball(radius, inwards=True)), cavities=True)
+        Mesh(
+            *joined(ball(1), ball(radius, inwards=True)),
+            cavities=True,
+        )
         for radius in (0.2, 0.5, 0.8)
     ]
     names = ("depth", "electrostatic_potential", "surface_direction")
@@ -260,7 +333,11 @@ def test_of_two_cavities_that_meet_at_a_vertex_both_are_turned_inwards():
     inwards = BALL.faces[:, ::-1]
 
     def hollow(second):
-        vertices, faces = joined((BALL.vertices, BALL.faces), (one, inwards), (other, second))
+        vertices, faces = joined(
+            (BALL.vertices, BALL.faces),
+            (one, inwards),
+            (other, second),
+        )
         n = len(BALL.vertices)
         last = np.delete(np.arange(3 * n), 2 * n + tip)  # the vertex that is there twice
         number = np.searchsorted(last, np.arange(3 * n))

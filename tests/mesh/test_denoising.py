@@ -21,7 +21,10 @@ def bumpy():
     surface = icosphere(subdivisions=4)
     x, y, z = surface.vertices.T
     bumps = 0.03 * np.sin(12 * x) * np.sin(11 * y + 1) * np.cos(10 * z)
-    return Mesh(np.asarray(surface.vertices) * (1 + bumps)[:, None], np.asarray(surface.faces))
+    return Mesh(
+        np.asarray(surface.vertices) * (1 + bumps)[:, None],
+        np.asarray(surface.faces),
+    )
 
 
 def test_noise_is_found_and_shape_is_not(sphere):
@@ -44,7 +47,10 @@ def test_rounding_creases_and_odd_triangles_are_no_noise():
 def test_the_rough_half_of_a_body_stays(sphere):
     rough = noise(sphere, 0.004, 0).vertices
     upper = sphere.vertices[:, 2:] > 0.2
-    assert not is_noisy(np.where(upper, rough, sphere.vertices), sphere.faces)
+    assert not is_noisy(
+        np.where(upper, rough, sphere.vertices),
+        sphere.faces,
+    )
 
 
 def test_area_and_volume_come_back(sphere):
@@ -77,11 +83,18 @@ def test_passes_follow_the_noise(ratio):
     assert smooth.volume == pytest.approx(ball.volume, rel=0.006)
     # In degrees; of the noisy surface from 10 upward.
     normals = smooth.vertices[faces].mean(axis=1)
-    cosines = np.einsum("ij,ij->i", _unit(area_vectors(smooth.vertices, faces)), _unit(normals))
+    cosines = np.einsum(
+        "ij,ij->i",
+        _unit(area_vectors(smooth.vertices, faces)),
+        _unit(normals),
+    )
     assert np.degrees(np.arccos(cosines.clip(-1, 1))).mean() < 4.5
 
 
-@pytest.mark.parametrize(("steps", "sections"), [(3, 256), (5, 200)])
+@pytest.mark.parametrize(
+    ("steps", "sections"),
+    [(3, 256), (5, 200)],
+)
 def test_turned_parts_of_thin_triangles_come_back(steps, sections):
     """Rims of many corners, far apart: noise as wide as a triangle crumples them. The clean part is the oracle."""
     random = default_rng(steps)
@@ -90,7 +103,10 @@ def test_turned_parts_of_thin_triangles_come_back(steps, sections):
     corners = [(r, z) for k, r in enumerate(radii) for z in (ends[k - 1] if k else 0, ends[k])]
     profile = [(0, 0), *corners, (0, ends[-1])]
     turned = trimesh.creation.revolve(np.array(profile), sections=sections)
-    part = Mesh(np.asarray(turned.vertices), np.asarray(turned.faces))
+    part = Mesh(
+        np.asarray(turned.vertices),
+        np.asarray(turned.faces),
+    )
     rough = noise(part, 0.002, seed=steps)
     assert not is_noisy(part.vertices, part.faces)
     assert is_noisy(rough.vertices, rough.faces)
@@ -106,12 +122,23 @@ def test_turned_parts_of_thin_triangles_come_back(steps, sections):
 def test_edges_of_a_box_stay_sharp():
     """The normals of its sides are the oracle, also of the triangles along its edges; smoothing alone rounds those."""
     box = trimesh.creation.box((1, 2, 3)).subdivide_to_size(0.1)
-    part = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
+    part = Mesh(
+        np.asarray(box.vertices),
+        np.asarray(box.faces),
+    )
     rough = noise(part, 0.003, seed=2)
     assert is_noisy(rough.vertices, rough.faces)
     smooth = Mesh(remove_noise(rough.vertices, rough.faces), part.faces)
     expected, found = (_unit(area_vectors(mesh.vertices, part.faces)) for mesh in (part, smooth))
-    off = np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", expected, found), -1, 1)))
+    off = np.degrees(
+        np.arccos(
+            np.clip(
+                np.einsum("ij,ij->i", expected, found),
+                -1,
+                1,
+            )
+        )
+    )
     assert off.mean() < 2
     beside = np.unique(box.face_adjacency[box.face_adjacency_angles > 1])
     assert off[beside].mean() < 5
@@ -126,7 +153,13 @@ def plate_with_holes(seed, longest_edge=None):
     random = default_rng(seed)
     plate = manifold3d.Manifold.cube((2, 1, 0.2), True)
     for x in (-0.6, 0, 0.6):
-        hole = manifold3d.Manifold.cylinder(1, random.uniform(0.1, 0.25), -1, 256, True)
+        hole = manifold3d.Manifold.cylinder(
+            1,
+            random.uniform(0.1, 0.25),
+            -1,
+            256,
+            True,
+        )
         plate -= hole.translate((x, random.uniform(-0.2, 0.2), 0))
     drawn = (plate if longest_edge is None else plate.refine_to_length(longest_edge)).to_mesh64()
     return Mesh(
@@ -135,7 +168,10 @@ def plate_with_holes(seed, longest_edge=None):
     )
 
 
-@pytest.mark.parametrize(("seed", "longest_edge"), [(0, None), (1, 0.06), (2, 0.06)])
+@pytest.mark.parametrize(
+    ("seed", "longest_edge"),
+    [(0, None), (1, 0.06), (2, 0.06)],
+)
 def test_plates_with_holes_keep_their_volume(seed, longest_edge):
     """Against the clean plate. Neighbours on a rim lie on one side of a vertex; noise may exceed slivers."""
     part = plate_with_holes(seed, longest_edge)
@@ -152,7 +188,10 @@ def test_a_fan_of_thousands_of_slivers_does_not_fold_up():
 
     ball = icosphere(subdivisions=5)
     whole = manifold3d.Manifold(
-        manifold3d.Mesh64(np.array(ball.vertices), np.array(ball.faces, dtype=np.uint64))
+        manifold3d.Mesh64(
+            np.array(ball.vertices),
+            np.array(ball.faces, dtype=np.uint64),
+        )
     )
     cone = manifold3d.Manifold.cylinder(1.2, 0.3, 0, 3000).translate((0, 0, 0.9))
     drawn = (whole + cone).to_mesh64()
@@ -178,7 +217,10 @@ def test_many_faces_are_filtered_as_few_are(sphere, monkeypatch):
 @pytest.mark.parametrize("scale", [1e-200, 1e200])
 def test_the_unit_of_length_does_not_matter(scale):
     ring = trimesh.creation.annulus(0.2, 0.5, 1, sections=512)
-    part = Mesh(np.asarray(ring.vertices), np.asarray(ring.faces))
+    part = Mesh(
+        np.asarray(ring.vertices),
+        np.asarray(ring.faces),
+    )
     rough = noise(part, 0.002, seed=1)
     assert not is_noisy(scale * part.vertices, part.faces)
     assert is_noisy(scale * rough.vertices, part.faces)
@@ -189,7 +231,10 @@ def test_the_unit_of_length_does_not_matter(scale):
 
 def test_a_knurled_knob_is_no_noise():
     """Teeth go up and down from vertex to vertex as noise does, but their flanks are planes."""
-    knob = trimesh.creation.revolve(np.array([(0, 0), (1, 0), (1, 1), (0, 1)]), sections=600)
+    knob = trimesh.creation.revolve(
+        np.array([(0, 0), (1, 0), (1, 1), (0, 1)]),
+        sections=600,
+    )
     vertices = np.array(knob.vertices)
     tooth = np.rint(np.arctan2(vertices[:, 1], vertices[:, 0]) / (2 * np.pi) * 600).astype(int) % 2
     vertices[:, :2] *= (1 + 0.01 * tooth)[:, None]
@@ -212,10 +257,16 @@ def test_coarse_bodies_are_told_apart_from_noisy_ones(index):
     mesh = Mesh(body.vertices, body.faces)
     assert not is_noisy(mesh.vertices, mesh.faces)
     edge = norm(np.diff(mesh.vertices[mesh.faces], axis=1), axis=2).mean()
-    assert is_noisy(noise(mesh, 0.18 * edge / mesh.diagonal, 0).vertices, mesh.faces)
+    assert is_noisy(
+        noise(mesh, 0.18 * edge / mesh.diagonal, 0).vertices,
+        mesh.faces,
+    )
 
 
-@pytest.mark.parametrize(("share", "expected"), [(0.005, True), (0.05, False)])
+@pytest.mark.parametrize(
+    ("share", "expected"),
+    [(0.005, True), (0.05, False)],
+)
 def test_what_is_full_of_holes_is_no_surface_to_look_over(sphere, share, expected):
     rough = noise(sphere, 0.004, 0)
     faces = rough.faces[default_rng(0).random(len(rough.faces)) >= share]
@@ -226,7 +277,10 @@ def test_boundaries_stay(sphere):
     faces = sphere.faces[sphere.vertices[sphere.faces].mean(axis=1)[:, 2] < 0.5]
     noisy = noise(sphere, 0.004, 1).vertices
     smooth = remove_noise(noisy, faces)
-    sides = np.sort(np.stack([faces, np.roll(faces, 1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    sides = np.sort(
+        np.stack([faces, np.roll(faces, 1, axis=1)], axis=-1).reshape(-1, 2),
+        axis=1,
+    )
     edges, count = np.unique(sides, axis=0, return_counts=True)
     rim = np.unique(edges[count == 1])
     assert_array_equal(smooth[rim], noisy[rim])

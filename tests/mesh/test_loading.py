@@ -15,7 +15,11 @@ from igps.mesh.options import LoadOptions
 
 
 def write_off(path, vertices, faces):
-    lines = ["OFF", f"{len(vertices)} {len(faces)} 0", *(" ".join(map(str, v)) for v in vertices)]
+    lines = [
+        "OFF",
+        f"{len(vertices)} {len(faces)} 0",
+        *(" ".join(map(str, v)) for v in vertices),
+    ]
     lines += [" ".join(map(str, [len(f), *f])) for f in faces]
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -88,9 +92,19 @@ def test_a_byte_order_mark_costs_no_vertex(tmp_path):
 
 
 def test_quads_become_triangles(tmp_path):
-    corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
+    corners = np.array(
+        [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)],
+        dtype=float,
+    )
     quads = np.array(
-        [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]]
+        [
+            [0, 2, 3, 1],
+            [4, 5, 7, 6],
+            [0, 1, 5, 4],
+            [1, 3, 7, 5],
+            [3, 2, 6, 7],
+            [2, 0, 4, 6],
+        ]
     )
     mesh = load_mesh(write_off(tmp_path / "cube.off", corners, quads))
     assert mesh.faces.shape == (12, 3)
@@ -105,8 +119,16 @@ def test_polygons_with_corners_turned_inwards_do_not_fold(start, tmp_path):
     angle = np.linspace(0, 2 * np.pi, 30, endpoint=False)
     if start == 3:
         angle = np.sort(random.uniform(0, 2 * np.pi, 4))
-    radius = np.where(np.arange(len(angle)) % 2, 1.0, random.uniform(0.1, 0.5, len(angle)))
-    x, y = np.roll(radius * (np.cos(angle), np.sin(angle)), start, axis=1)
+    radius = np.where(
+        np.arange(len(angle)) % 2,
+        1.0,
+        random.uniform(0.1, 0.5, len(angle)),
+    )
+    x, y = np.roll(
+        radius * (np.cos(angle), np.sin(angle)),
+        start,
+        axis=1,
+    )
     area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
     around = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
     n = len(x)
@@ -125,13 +147,25 @@ def test_polygons_with_corners_turned_inwards_do_not_fold(start, tmp_path):
 
 def test_a_polygon_around_a_hole_does_not_fold(tmp_path):
     """A square with a square hole, reached by an edge that is run through twice, as CAD programs write it."""
-    square = [(0, 0), (3, 0), (3, 3), (0, 3), (1, 1), (1, 2), (2, 2), (2, 1)]
+    square = [
+        (0, 0),
+        (3, 0),
+        (3, 3),
+        (0, 3),
+        (1, 1),
+        (1, 2),
+        (2, 2),
+        (2, 1),
+    ]
     (tmp_path / "ring.obj").write_text(
         "\n".join(f"v {x} {y} 0" for x, y in square) + "\nf 1 2 3 4 1 5 6 7 8 5\n"
     )
     surface = read_surface(tmp_path / "ring.obj")
     corners = surface.vertices[surface.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.cross(
+        corners[:, 1] - corners[:, 0],
+        corners[:, 2] - corners[:, 0],
+    )
     assert (normals[:, 2] >= 0).all()
     assert normals[:, 2].sum() / 2 == pytest.approx(8)
 
@@ -179,13 +213,33 @@ def test_off_files_are_read_as_trimesh_reads_them(tmp_path):
         plain.replace("\n", "\n\n"),
         plain.replace("OFF\n", "OFF "),
         "# a ball\n" + plain,
-        "\n".join([*lines[:2], "# vertices", *lines[2:14], "# faces", *lines[14:]]),
+        "\n".join(
+            [
+                *lines[:2],
+                "# vertices",
+                *lines[2:14],
+                "# faces",
+                *lines[14:],
+            ]
+        ),
         plain + "# a ball\n",
         plain + "3 0 1 2\n",
         "\n".join(lines[:-1]),
         "\n".join([*lines[:5], *lines[6:]]),
-        "\n".join([lines[0], lines[1], *(line + " 0 0 1" for line in lines[2:14]), *lines[14:]]),
-        "\n".join([*lines[:14], *(line + " 255 0 0" for line in lines[14:])]),
+        "\n".join(
+            [
+                lines[0],
+                lines[1],
+                *(line + " 0 0 1" for line in lines[2:14]),
+                *lines[14:],
+            ]
+        ),
+        "\n".join(
+            [
+                *lines[:14],
+                *(line + " 255 0 0" for line in lines[14:]),
+            ]
+        ),
         "\n".join([*lines[:14], "4 0 1 2 3", *lines[15:]]),
         "\n".join([*lines[:14], "3 0 1 2.5", *lines[15:]]),
         "\n".join([*lines[:14], "3 0 1 12", *lines[15:]]),
@@ -198,9 +252,17 @@ def test_off_files_are_read_as_trimesh_reads_them(tmp_path):
     alphabet = [*"0123456789.-+eEnaif #\n\t,x", "٣", "\x0c"]
     for _ in range(800):
         text = list(plain)
-        for place in random.integers(0, len(text), random.integers(1, 4)):
+        for place in random.integers(
+            0,
+            len(text),
+            random.integers(1, 4),
+        ):
             text[place] = random.choice(
-                ["", random.choice(alphabet), text[place] + random.choice(alphabet)]
+                [
+                    "",
+                    random.choice(alphabet),
+                    text[place] + random.choice(alphabet),
+                ]
             )
         texts.append("".join(text))
     outcomes = []
@@ -248,7 +310,11 @@ def test_loose_triangles_need_and_get_welding(tmp_path, away):
     surface = icosphere(subdivisions=2)
     loose = np.asarray(surface.vertices)[surface.faces].reshape(-1, 3)
     loose = loose + default_rng(0).uniform(-away, away, loose.shape)
-    path = write_off(tmp_path / "mesh.off", loose, np.arange(len(loose)).reshape(-1, 3))
+    path = write_off(
+        tmp_path / "mesh.off",
+        loose,
+        np.arange(len(loose)).reshape(-1, 3),
+    )
     with pytest.raises(MeshError, match="boundary edges"):
         load_mesh(path, LoadOptions("never"))
     mesh = load_mesh(path)
@@ -280,7 +346,12 @@ def test_pieces_that_are_no_body_together_are_bodies_each(tmp_path):
     fine = icosphere(subdivisions=3)
     large = trimesh.creation.box((5, 5, 5))
     vertices = np.vstack([fine.vertices + 20, large.vertices])
-    faces = np.vstack([fine.faces, large.faces + len(fine.vertices)])
+    faces = np.vstack(
+        [
+            fine.faces,
+            large.faces + len(fine.vertices),
+        ]
+    )
     path = write_off(tmp_path / "two.off", vertices, faces)
     with pytest.raises(MeshError, match="2 connected components"):
         load_mesh(path, LoadOptions("never"))
@@ -302,7 +373,10 @@ def test_unknown_way_to_mend_is_refused():
         LoadOptions(mend="please")
 
 
-@pytest.mark.parametrize(("suffix", "normals"), [("xyz", False), ("ply", True)])
+@pytest.mark.parametrize(
+    ("suffix", "normals"),
+    [("xyz", False), ("ply", True)],
+)
 def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(tmp_path, suffix, normals):
     surface = icosphere(subdivisions=4)
     rows = np.asarray(surface.vertices) * [1, 0.8, 1.3]

@@ -20,7 +20,11 @@ from igps.mesh.watertight import watertight
 
 def box():
     surface = trimesh.creation.box((1, 2, 3))
-    return Mesh(np.asarray(surface.vertices), np.asarray(surface.faces), name="box")
+    return Mesh(
+        np.asarray(surface.vertices),
+        np.asarray(surface.faces),
+        name="box",
+    )
 
 
 def area(vertices, faces):
@@ -40,7 +44,13 @@ def same_surface(a, b):
         turned = np.take_along_axis(corners, order[:, :, None], axis=1).reshape(-1, 9)
         return turned[np.lexsort(turned.T[::-1])]
 
-    return len(a.faces) == len(b.faces) and bool(np.allclose(canonical(a), canonical(b), atol=2e-5))
+    return len(a.faces) == len(b.faces) and bool(
+        np.allclose(
+            canonical(a),
+            canonical(b),
+            atol=2e-5,
+        )
+    )
 
 
 def test_a_body_is_left_as_it_is(blob):
@@ -66,7 +76,10 @@ def test_holes_are_filled_where_the_surface_was(sphere):
     assert np.abs(norm(mesh.vertices, axis=1) - 1).max() < 0.01
     assert mesh.volume == pytest.approx(sphere.volume, rel=2e-3)
     sides = mesh.vertices[mesh.faces]
-    length = norm(sides - np.roll(sides, 1, axis=1), axis=2)
+    length = norm(
+        sides - np.roll(sides, 1, axis=1),
+        axis=2,
+    )
     assert length.max() < 3 * np.median(length)
 
 
@@ -83,7 +96,10 @@ def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere):
     """Those of a disc of radius r = n / 2π steps that are one step apart: about π r² = n² / 4π."""
     away = norm(sphere.vertices - sphere.vertices[0], axis=1)
     kept = sphere.faces[(away[sphere.faces] > 0.11 * np.ptp(sphere.vertices)).all(axis=1)]
-    sides = np.sort(kept[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    sides = np.sort(
+        kept[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2),
+        axis=1,
+    )
     _, counts = np.unique(sides, axis=0, return_counts=True)
     n = int((counts == 1).sum())
     assert n > 15
@@ -114,7 +130,10 @@ def test_a_part_that_sticks_out_is_not_hidden():
     knob = icosphere(subdivisions=2, radius=0.3)
     knob.apply_translation([1, 0, 0])
     whole = trimesh.util.concatenate([surface, knob])
-    mesh = mend(np.asarray(whole.vertices), np.asarray(whole.faces))
+    mesh = mend(
+        np.asarray(whole.vertices),
+        np.asarray(whole.faces),
+    )
     assert repair_steps(mesh.notes) == ("united",)
     found = mesh.vertices[:, 0].max()
     expected = pytest.approx(1.3, abs=1e-9)
@@ -137,7 +156,10 @@ def test_longest_edges_are_cut_first(n_vertices):
     mesh = subdivide(box(), n_vertices)
     assert len(mesh.vertices) == n_vertices
     sides = mesh.vertices[mesh.faces]
-    length = norm(sides - np.roll(sides, 1, axis=1), axis=2)
+    length = norm(
+        sides - np.roll(sides, 1, axis=1),
+        axis=2,
+    )
     if n_vertices > 50:
         assert length.max() < 4.5 * np.sqrt(22 / n_vertices)
     assert (norm(area_vectors(mesh.vertices, mesh.faces), axis=1) > 1e-6).all()
@@ -181,7 +203,10 @@ def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertig
         mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), (100_000, 3)
     )
     turn = np.linspace(0, 2.2, 3000)
-    middles = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn), 0.3 * turn], axis=1)
+    middles = np.stack(
+        [np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn), 0.3 * turn],
+        axis=1,
+    )
     away, nearest = cKDTree(middles).query(points)
     # Without the half balls beyond the flat ends; the radius is that of a circle of the polygon's area.
     radius = 0.2 * np.sqrt(8 / np.pi * np.sin(np.pi / 8))
@@ -197,14 +222,44 @@ def coil(turns, pitch, radius=0.2):
     around = 16
     turn = np.linspace(0, turns, n)[:, None]
     angle = 2 * np.pi * turn
-    middles = np.hstack([np.cos(angle), np.sin(angle), pitch * turn])
-    along = np.hstack([-np.sin(angle), np.cos(angle), np.full_like(turn, pitch / (2 * np.pi))])
-    outward = np.hstack([np.cos(angle), np.sin(angle), np.zeros_like(turn)])
-    upward = np.cross(outward, along / norm(along, axis=1, keepdims=True))
+    middles = np.hstack(
+        [
+            np.cos(angle),
+            np.sin(angle),
+            pitch * turn,
+        ]
+    )
+    along = np.hstack(
+        [
+            -np.sin(angle),
+            np.cos(angle),
+            np.full_like(turn, pitch / (2 * np.pi)),
+        ]
+    )
+    outward = np.hstack(
+        [
+            np.cos(angle),
+            np.sin(angle),
+            np.zeros_like(turn),
+        ]
+    )
+    upward = np.cross(
+        outward,
+        along / norm(along, axis=1, keepdims=True),
+    )
     phase = 2 * np.pi * np.arange(around) / around
     rings = np.cos(phase)[:, None] * outward[:, None] + np.sin(phase)[:, None] * upward[:, None]
-    vertices = np.vstack([(middles[:, None] + radius * rings).reshape(-1, 3), middles[[0, -1]]])
-    i, j = np.meshgrid(np.arange(n - 1), np.arange(around), indexing="ij")
+    vertices = np.vstack(
+        [
+            (middles[:, None] + radius * rings).reshape(-1, 3),
+            middles[[0, -1]],
+        ]
+    )
+    i, j = np.meshgrid(
+        np.arange(n - 1),
+        np.arange(around),
+        indexing="ij",
+    )
     a = i * around + j
     b = i * around + (j + 1) % around
     c = a + around
@@ -214,8 +269,14 @@ def coil(turns, pitch, radius=0.2):
     ring = np.arange(around)
     following = (np.arange(around) + 1) % around
     last = (n - 1) * around
-    start = np.stack([following, ring, np.full(around, n * around)], axis=1)
-    end = np.stack([last + ring, last + following, np.full(around, n * around + 1)], axis=1)
+    start = np.stack(
+        [following, ring, np.full(around, n * around)],
+        axis=1,
+    )
+    end = np.stack(
+        [last + ring, last + following, np.full(around, n * around + 1)],
+        axis=1,
+    )
     return Mesh(vertices, np.vstack([upper, lower, start, end]))
 
 
@@ -227,7 +288,13 @@ def test_a_cloud_is_a_surface(sphere):
 
 def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob):
     mesh = mend(
-        np.vstack([blob.vertices[:9], [[1e9, 0, 0]], blob.vertices[9:]]),
+        np.vstack(
+            [
+                blob.vertices[:9],
+                [[1e9, 0, 0]],
+                blob.vertices[9:],
+            ]
+        ),
         blob.faces + (blob.faces >= 9),
     )
     assert same_surface(mesh, blob)
@@ -238,9 +305,19 @@ def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob):
 def test_corners_that_differ_in_the_last_digit_of_single_precision_are_one(blob, share):
     generator = default_rng(0)
     corners = blob.vertices[blob.faces].reshape(-1, 3).astype(np.float32)
-    moved = np.nextafter(corners, generator.choice(np.float32([-9, 9]), corners.shape))
-    corners = np.where(generator.random(corners.shape) < share, moved, corners)
-    mesh = mend(corners.astype(np.float64), np.arange(len(corners)).reshape(-1, 3))
+    moved = np.nextafter(
+        corners,
+        generator.choice(np.float32([-9, 9]), corners.shape),
+    )
+    corners = np.where(
+        generator.random(corners.shape) < share,
+        moved,
+        corners,
+    )
+    mesh = mend(
+        corners.astype(np.float64),
+        np.arange(len(corners)).reshape(-1, 3),
+    )
     assert repair_steps(mesh.notes) == ("welded",)
     assert len(mesh.vertices) == len(blob.vertices)
     assert mesh.area == pytest.approx(blob.area, rel=1e-5)

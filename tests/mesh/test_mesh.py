@@ -132,7 +132,10 @@ def test_a_trimesh_becomes_a_mesh_and_a_mesh_stays_itself():
         as_mesh(box)
 
 
-@pytest.mark.parametrize("body", [None, "box.ply", np.zeros((3, 3)), trimesh.Scene()])
+@pytest.mark.parametrize(
+    "body",
+    [None, "box.ply", np.zeros((3, 3)), trimesh.Scene()],
+)
 def test_what_is_no_mesh_is_named(body):
     with pytest.raises(
         TypeError,
@@ -158,7 +161,14 @@ def test_meshes_of_other_libraries(blob):
         assert_array_equal(mesh.faces, blob.faces)
         assert mesh.name == "mesh"
         assert mesh.unit == unit
-    quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]]
+    quads = [
+        [0, 2, 3, 1],
+        [4, 5, 7, 6],
+        [0, 1, 5, 4],
+        [1, 3, 7, 5],
+        [3, 2, 6, 7],
+        [2, 0, 4, 6],
+    ]
     corners = np.array(
         [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float32
     )
@@ -168,7 +178,10 @@ def test_meshes_of_other_libraries(blob):
 
 def test_voxels_of_one_label_are_a_mesh():
     ball = ((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0) < 8**2
-    image = nibabel.Nifti1Image(5 * ball.astype(np.uint8), np.diag([-1, 1, 2, 1]))
+    image = nibabel.Nifti1Image(
+        5 * ball.astype(np.uint8),
+        np.diag([-1, 1, 2, 1]),
+    )
     for thing, spacing, unit in ((image, None, "mm"), (ball, (1, 1, 2), "mm"), (ball, None, None)):
         mesh = as_mesh(thing, spacing)
         sides = 1 if unit is None else 2

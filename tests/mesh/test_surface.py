@@ -11,15 +11,32 @@ from igps.mesh import surface
 
 def test_areas_and_normals(blob):
     oracle = as_trimesh(blob)
-    assert_allclose(surface.face_areas(blob.vertices, blob.faces), oracle.area_faces, rtol=1e-12)
+    assert_allclose(
+        surface.face_areas(blob.vertices, blob.faces),
+        oracle.area_faces,
+        rtol=1e-12,
+    )
     of_vertices = np.zeros(len(blob.vertices))
     sums = np.zeros_like(blob.vertices)
-    for face, area, normal in zip(blob.faces, oracle.area_faces, oracle.face_normals, strict=True):
+    for face, area, normal in zip(
+        blob.faces,
+        oracle.area_faces,
+        oracle.face_normals,
+        strict=True,
+    ):
         of_vertices[face] += area / 3
         sums[face] += area * normal
-    assert_allclose(surface.vertex_areas(blob.vertices, blob.faces), of_vertices, rtol=1e-12)
+    assert_allclose(
+        surface.vertex_areas(blob.vertices, blob.faces),
+        of_vertices,
+        rtol=1e-12,
+    )
     normals = sums / np.linalg.norm(sums, axis=1, keepdims=True)
-    assert_allclose(surface.vertex_normals(blob.vertices, blob.faces), normals, atol=1e-12)
+    assert_allclose(
+        surface.vertex_normals(blob.vertices, blob.faces),
+        normals,
+        atol=1e-12,
+    )
 
 
 def test_the_mean_of_neighbours_is_that_of_a_loop(blob):
@@ -28,7 +45,11 @@ def test_the_mean_of_neighbours_is_that_of_a_loop(blob):
         beside = blob.vertices[neighbours]
         weights = 1 / np.square(beside - blob.vertices[i]).sum(axis=1)
         expected[i] = weights @ beside / weights.sum()
-    assert_allclose(surface.mean_of_neighbours(blob.vertices, blob.faces), expected, rtol=1e-9)
+    assert_allclose(
+        surface.mean_of_neighbours(blob.vertices, blob.faces),
+        expected,
+        rtol=1e-9,
+    )
 
 
 def test_a_neighbour_in_the_same_place_is_the_mean(blob):
@@ -55,7 +76,10 @@ def test_edges(blob):
 @pytest.mark.parametrize("n_handles", [0, 1, 2, 3])
 def test_genus_counts_handles(n_handles):
     """A slab of cubes with holes through it; the surface of voxels that share faces alone is a manifold."""
-    cells = np.ones((2 * n_handles + 1, 3, 1), dtype=bool)
+    cells = np.ones(
+        (2 * n_handles + 1, 3, 1),
+        dtype=bool,
+    )
     cells[1::2, 1] = False
     voxels = trimesh.voxel.ops.matrix_to_marching_cubes(cells)
     mesh = as_mesh(voxels)
@@ -69,10 +93,22 @@ def test_parts_of_faces_and_their_areas():
     ]
     whole = trimesh.util.concatenate(pieces)
     # A vertex of no face in between is no part.
-    vertices = np.insert(np.asarray(whole.vertices), 162, [9, 9, 9], axis=0)
-    faces = np.where(whole.faces >= 162, whole.faces + 1, whole.faces)
+    vertices = np.insert(
+        np.asarray(whole.vertices),
+        162,
+        [9, 9, 9],
+        axis=0,
+    )
+    faces = np.where(
+        whole.faces >= 162,
+        whole.faces + 1,
+        whole.faces,
+    )
     shuffled = np.random.default_rng(0).permutation(len(faces))
     part, areas = surface.face_parts(vertices, faces[shuffled])
-    assert_array_equal(part, np.repeat([0, 1, 2], [len(piece.faces) for piece in pieces])[shuffled])
+    assert_array_equal(
+        part,
+        np.repeat([0, 1, 2], [len(piece.faces) for piece in pieces])[shuffled],
+    )
     expected = [piece.area for piece in pieces]
     assert_allclose(areas, expected, rtol=1e-12)

@@ -24,7 +24,10 @@ def together(*surfaces):
 
 
 def test_boxes_that_overlap_are_one_body_of_the_right_volume_and_area():
-    surface = together(box([0, 0, 0], [2, 1, 1]), box([1.3, 0.2, 0.25], [3, 0.7, 0.75]))
+    surface = together(
+        box([0, 0, 0], [2, 1, 1]),
+        box([1.3, 0.2, 0.25], [3, 0.7, 0.75]),
+    )
     body = mend(*surface)
     assert repair_steps(body.notes) == ("united",)
     # The second box reaches 0.7 into the first.
@@ -35,9 +38,15 @@ def test_boxes_that_overlap_are_one_body_of_the_right_volume_and_area():
 
 
 def test_parts_that_do_not_touch_or_are_open_are_left_to_the_grid():
-    apart = together(box([0, 0, 0], [1, 1, 1]), box([2, 0, 0], [3, 1, 1]))
+    apart = together(
+        box([0, 0, 0], [1, 1, 1]),
+        box([2, 0, 0], [3, 1, 1]),
+    )
     vertices, faces = box([0.5, 0.5, 0.5], [2, 2, 2])
-    opened = together(box([0, 0, 0], [1, 1, 1]), (vertices, faces[len(faces) // 2 :]))
+    opened = together(
+        box([0, 0, 0], [1, 1, 1]),
+        (vertices, faces[len(faces) // 2 :]),
+    )
     for surface in (apart, opened):
         steps = repair_steps(mend(*surface).notes)
         assert "watertight" in steps
@@ -49,7 +58,10 @@ def with_wall():
     vertices, faces = box([0, 0, 0], [1, 1, 1])
     # The same triangles on both sides of the wall
     mirrored = vertices * [-1, 1, 1] + [2, 0, 0]
-    return together((vertices, faces), (mirrored, faces[:, ::-1]))
+    return together(
+        (vertices, faces),
+        (mirrored, faces[:, ::-1]),
+    )
 
 
 def test_a_wall_between_two_halves_is_dropped_and_nothing_else():
@@ -66,7 +78,12 @@ def test_two_halves_with_a_wall_each_that_overlap_are_the_body_that_they_were_cu
     shape = ArticulatedShapes(3, 1, seed=4)[2]
     shape = Mesh(shape.vertices, shape.faces)
     centred = shape.vertices - shape.vertices.mean(axis=0)
-    solid = manifold3d.Manifold(manifold3d.Mesh64(centred.copy(), shape.faces.astype(np.uint64)))
+    solid = manifold3d.Manifold(
+        manifold3d.Mesh64(
+            centred.copy(),
+            shape.faces.astype(np.uint64),
+        )
+    )
     reach = 0.02 * np.ptp(centred, axis=0).max()
     halves = []
     for normal in ([1.0, 0, 0], [-1.0, 0, 0]):

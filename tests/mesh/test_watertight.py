@@ -26,7 +26,10 @@ BALL = 4 / 3 * np.pi
 
 def arrays(*parts):
     whole = trimesh.util.concatenate(parts)
-    return np.asarray(whole.vertices, dtype=np.float64), np.asarray(whole.faces, dtype=np.int64)
+    return np.asarray(
+        whole.vertices,
+        dtype=np.float64,
+    ), np.asarray(whole.faces, dtype=np.int64)
 
 
 def ball(radius=1.0, centre=(0, 0, 0), subdivisions=3):
@@ -101,7 +104,12 @@ def test_a_hole_is_closed_and_a_cup_stays_open():
     assert any("opening" in note for note in holed.notes)
     cup = watertight(*cut_ball(0.3), resolution=64)
     assert_closed(cup)
-    found = is_inside(cup, (0, 0, 0), (0, 0, -0.9), (0, 0, -1))
+    found = is_inside(
+        cup,
+        (0, 0, 0),
+        (0, 0, -0.9),
+        (0, 0, -1),
+    )
     assert found == [False, False, True]
     # A sheet of about a cell.
     cell = 2 / 64
@@ -120,20 +128,43 @@ def test_a_missing_base_is_no_leak_beyond_the_bounding_box():
 
 
 def test_the_neck_of_a_bottle_is_closed_unless_its_wall_has_two_sides():
-    outer = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.5), (0.2, 1.8), (0.2, 2.2)]
-    found = is_inside(watertight(*turned_profile(outer), resolution=48), (0, 0, 0.8))
+    outer = [
+        (0.0, 0.0),
+        (1.0, 0.0),
+        (1.0, 1.5),
+        (0.2, 1.8),
+        (0.2, 2.2),
+    ]
+    found = is_inside(
+        watertight(*turned_profile(outer), resolution=48),
+        (0, 0, 0.8),
+    )
     assert found == [True]
-    inner = [(0.14, 2.2), (0.14, 1.75), (0.94, 1.45), (0.94, 0.06), (0.0, 0.06)]
+    inner = [
+        (0.14, 2.2),
+        (0.14, 1.75),
+        (0.94, 1.45),
+        (0.94, 0.06),
+        (0.0, 0.06),
+    ]
     vase = watertight(*turned_profile(outer + inner), resolution=64)
     found = is_inside(vase, (0, 0, 0.8), (0, 0, 2.0))
     assert found == [False, False]
-    found = is_inside(vase, (0, 0, 0.03), (0.97, 0, 0.8))
+    found = is_inside(
+        vase,
+        (0, 0, 0.03),
+        (0.97, 0, 0.8),
+    )
     assert found == [True, True]
 
 
 def test_what_is_hidden_is_filled():
     body = watertight(
-        *arrays(ball(), ball(0.3, (0.2, 0, 0)), box((0.5, 0.4, 0.3))),
+        *arrays(
+            ball(),
+            ball(0.3, (0.2, 0, 0)),
+            box((0.5, 0.4, 0.3)),
+        ),
         resolution=64,
     )
     alone = watertight(*arrays(ball()), resolution=64)
@@ -151,18 +182,33 @@ def test_overlapping_parts_are_one():
     assert body.volume == expected
 
 
-@pytest.mark.parametrize("turned", [(False, True), (True, True)])
+@pytest.mark.parametrize(
+    "turned",
+    [(False, True), (True, True)],
+)
 def test_parts_are_turned_outward_by_their_winding_numbers(turned):
     # Two rings: the far sides of each face its middle, so that no simple rule tells their outside.
     rings = [torus(10.0, 1.0, major_sections=48, minor_sections=16) for _ in range(2)]
-    rings[1].apply_transform(trimesh.transformations.rotation_matrix(1.2, [1, 0, 0]))
+    rings[1].apply_transform(
+        trimesh.transformations.rotation_matrix(
+            1.2,
+            [1, 0, 0],
+        )
+    )
     for ring, inverted in zip(rings, turned, strict=True):
         if inverted:
             ring.invert()
     vertices, faces = arrays(*rings)
     # A fortieth of the faces is missing from one place.
-    away = norm(vertices[faces].mean(axis=1) - [10, 0, 0], axis=1)
-    body = watertight(vertices, faces[np.argsort(away)[len(faces) // 40 :]], resolution=64)
+    away = norm(
+        vertices[faces].mean(axis=1) - [10, 0, 0],
+        axis=1,
+    )
+    body = watertight(
+        vertices,
+        faces[np.argsort(away)[len(faces) // 40 :]],
+        resolution=64,
+    )
     inside = (-10, 0, 0), (0, 10, 0), (0, 10 * np.cos(1.2), 10 * np.sin(1.2))
     assert is_inside(body, *inside) == [True] * 3
     found = is_inside(body, (0, 0, 0), (0, 0, 9))
@@ -180,11 +226,17 @@ def test_a_thin_body_of_overlapping_halves_with_holes_is_solid(number):
 
 
 def test_parts_that_share_an_edge_are_one():
-    vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    vertices = np.array(
+        [[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)],
+        dtype=float,
+    )
     faces = np.asarray(trimesh.Trimesh(vertices).convex_hull.faces)
     hull = np.asarray(trimesh.Trimesh(vertices).convex_hull.vertices)
     pair = np.vstack([hull, hull + np.array([1, 1, 0])])
-    body = watertight(pair, np.vstack([faces, faces + len(hull)]))
+    body = watertight(
+        pair,
+        np.vstack([faces, faces + len(hull)]),
+    )
     assert_closed(body)
     assert body.volume == pytest.approx(2, rel=0.02)
 
@@ -200,11 +252,20 @@ def test_a_wall_inside_that_lies_on_points_of_the_grid_is_filled():
 
 
 def test_a_sheet_gets_about_a_cell():
-    x, y = (values.ravel() for values in np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5)))
+    x, y = (
+        values.ravel()
+        for values in np.meshgrid(
+            np.linspace(0, 1, 5),
+            np.linspace(0, 1, 5),
+        )
+    )
     vertices = np.stack([x, y, np.zeros_like(x)], axis=1)
     start = np.array([5 * i + j for i in range(4) for j in range(4)])
     faces = np.vstack(
-        [np.stack([start, start + 1, start + 6], 1), np.stack([start, start + 6, start + 5], 1)]
+        [
+            np.stack([start, start + 1, start + 6], 1),
+            np.stack([start, start + 6, start + 5], 1),
+        ]
     )
     body = watertight(vertices, faces, resolution=48)
     assert_closed(body)
@@ -213,22 +274,36 @@ def test_a_sheet_gets_about_a_cell():
 
 
 def test_pieces_are_joined_and_specks_dropped():
-    apart = watertight(*arrays(ball(), ball(0.7, (2.5, 0, 0))), resolution=64)
+    apart = watertight(
+        *arrays(ball(), ball(0.7, (2.5, 0, 0))),
+        resolution=64,
+    )
     assert_closed(apart)
     expected = pytest.approx(BALL * (1 + 0.7**3), rel=0.03)
     assert apart.volume == expected
     assert any("joined 2 pieces" in note for note in apart.notes)
-    speck = watertight(*arrays(ball(), ball(0.01, (5, 5, 5))), resolution=48)
+    speck = watertight(
+        *arrays(ball(), ball(0.01, (5, 5, 5))),
+        resolution=48,
+    )
     alone = watertight(*arrays(ball()), resolution=48)
     assert_array_equal(speck.vertices, alone.vertices)
 
 
 def test_wires_stay_in_one_piece():
     t = np.linspace(0, 4 * np.pi, 200)
-    path = np.stack([np.cos(t), np.sin(t), t / 6], axis=1)
+    path = np.stack(
+        [np.cos(t), np.sin(t), t / 6],
+        axis=1,
+    )
     strip = np.vstack([path, path + np.array([0, 0, 1e-3])])
     i = np.arange(199)
-    faces = np.vstack([np.stack([i, i + 1, i + 200], 1), np.stack([i + 1, i + 201, i + 200], 1)])
+    faces = np.vstack(
+        [
+            np.stack([i, i + 1, i + 200], 1),
+            np.stack([i + 1, i + 201, i + 200], 1),
+        ]
+    )
     body = watertight(strip, faces)
     assert_closed(body)
     found = np.ptp(body.vertices, axis=0)
@@ -246,7 +321,11 @@ def test_point_clouds(with_normals):
 
 
 def test_flat_places_have_a_delaunay_triangulation():
-    body = watertight(*arrays(box((1, 1, 0.6))), resolution=48, max_vertices=500)
+    body = watertight(
+        *arrays(box((1, 1, 0.6))),
+        resolution=48,
+        max_vertices=500,
+    )
     assert_closed(body)
     opposite = {}
     for face in body.faces.tolist():
@@ -264,7 +343,11 @@ def test_flat_places_have_a_delaunay_triangulation():
 def test_follows_the_surface_when_it_is_moved_and_scaled():
     vertices, faces = arrays(torus(1.0, 0.3))
     body = watertight(vertices, faces, resolution=64)
-    moved = watertight(vertices * 8 + [16, -32, 64], faces, resolution=64)
+    moved = watertight(
+        vertices * 8 + [16, -32, 64],
+        faces,
+        resolution=64,
+    )
     expected = body.vertices * 8 + [16, -32, 64]
     assert_allclose(moved.vertices, expected, atol=8 * 0.02)
     expected = pytest.approx(2 * np.pi**2 * 0.09, rel=0.03)
@@ -300,14 +383,25 @@ def test_what_is_no_surface_is_refused():
     ):
         watertight(default_rng(0).random((5, 3)), name="five.xyz")
     with pytest.raises(MeshError, match="finite"):
-        watertight(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
+        watertight(
+            np.full((3, 3), np.nan),
+            np.array([[0, 1, 2]]),
+        )
     with pytest.raises(ValueError, match="resolution"):
         watertight(*arrays(ball()), resolution=2)
 
 
 def chain(n, gap):
     """Unit balls in a row."""
-    return arrays(*(ball(centre=(gap * i, 0, 0), subdivisions=2) for i in range(n)))
+    return arrays(
+        *(
+            ball(
+                centre=(gap * i, 0, 0),
+                subdivisions=2,
+            )
+            for i in range(n)
+        )
+    )
 
 
 @pytest.mark.parametrize("gap", [1.9, 2.1])
@@ -318,7 +412,10 @@ def test_a_chain_of_beads_gets_a_grid_as_fine_as_its_beads_ask_for(gap):
     assert_closed(body)
     bead = ball(subdivisions=2)
     assert body.volume == pytest.approx(60 * bead.volume, rel=0.015)
-    expected = pytest.approx(60 * bead.area * (1 - hidden), rel=0.05)
+    expected = pytest.approx(
+        60 * bead.area * (1 - hidden),
+        rel=0.05,
+    )
     assert body.area == expected
     # Between beads it is thin again.
     near = np.abs(body.vertices[:, 0] - 30.5 * gap) < 0.1

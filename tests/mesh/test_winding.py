@@ -17,7 +17,11 @@ def test_winding_number_is_one_inside_and_zero_outside(mesh):
     assert_allclose(found, 1, atol=1e-12)
     found = winding_number(*mesh, exterior_points(mesh, 100))
     assert_allclose(found, 0, atol=1e-12)
-    assert_allclose(winding_number(mesh[0], mesh[1][:, ::-1], mesh[0][:1] / 2 + 100), 0, atol=1e-12)
+    assert_allclose(
+        winding_number(mesh[0], mesh[1][:, ::-1], mesh[0][:1] / 2 + 100),
+        0,
+        atol=1e-12,
+    )
 
 
 def winding_by_loops(vertices, faces, points):
@@ -56,13 +60,21 @@ def test_winding_number_is_the_sum_of_solid_angles(kind):
     for more in (np.concatenate([faces, flat]), np.concatenate([np.tile(flat, (40, 1)), faces])):
         found = winding_number(vertices, more, points)
         assert_allclose(found, expected, atol=1e-7)
-    assert_allclose(winding_number(1e3 + vertices, faces, 1e3 + points), expected, atol=1e-7)
+    assert_allclose(
+        winding_number(1e3 + vertices, faces, 1e3 + points),
+        expected,
+        atol=1e-7,
+    )
 
 
 def test_winding_number_of_flat_faces_alone_is_refused():
     flat = np.array([[0, 1, 1], [2, 2, 2]])
     with pytest.raises(ValueError, match="expected at least one face with an area"):
-        winding_number(cube()[0], flat, np.zeros((1, 3)))
+        winding_number(
+            cube()[0],
+            flat,
+            np.zeros((1, 3)),
+        )
 
 
 def test_no_points_have_no_winding_numbers():

@@ -28,7 +28,12 @@ def test_nearest_directions_are_those_of_a_loop():
     expected = normalize(targets.mean(dim=0) - points, dim=1)
     assert_close(whole, expected)
     few = nearest_directions(
-        points, targets.masked_fill(torch.arange(20)[:, None] > 4, torch.nan), torch.arange(20) < 5
+        points,
+        targets.masked_fill(
+            torch.arange(20)[:, None] > 4,
+            torch.nan,
+        ),
+        torch.arange(20) < 5,
     )
     expected = normalize(targets[:5].mean(dim=0) - points, dim=1)
     assert_close(few, expected)
@@ -69,7 +74,10 @@ def test_neighbours_in_the_embedding_are_found_once_whatever_the_padding():
     for i, n in enumerate(N_POINTS):
         points = embedded(batch, i, "surface", 4)
         apart = (points[:, None] - points).norm(dim=2).fill_diagonal_(torch.inf)
-        assert torch.equal(found[i, :n], apart.argsort(dim=1)[:, :16])
+        assert torch.equal(
+            found[i, :n],
+            apart.argsort(dim=1)[:, :16],
+        )
 
 
 def test_subsets():
@@ -93,7 +101,10 @@ def test_subsets():
 def test_nearest_points_are_those_of_a_loop():
     points = torch.randn(30, 4, generator=torch.Generator().manual_seed(3))
     apart = torch.cdist(points, points).fill_diagonal_(torch.inf)
-    assert torch.equal(nearest_neighbours(points, 5), apart.argsort(dim=1)[:, :5])
+    assert torch.equal(
+        nearest_neighbours(points, 5),
+        apart.argsort(dim=1)[:, :5],
+    )
     assert nearest_neighbours(points[:3], 5).shape == (3, 2)
     few = torch.arange(30) % 10 == 4
     for i, found in enumerate(nearest_neighbours(points, 5, few).tolist()):

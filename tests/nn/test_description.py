@@ -64,7 +64,10 @@ class Area(BodyDescriptor):
         return np.array([body.mesh.area, body.area], dtype=np.float32)
 
 
-@pytest.mark.parametrize(("batch_size", "n_workers"), [(3, 1), (1, 3)])
+@pytest.mark.parametrize(
+    ("batch_size", "n_workers"),
+    [(3, 1), (1, 3)],
+)
 def test_describe_is_the_descriptor_of_each_batch(dataset, batch_size, n_workers):
     descriptor = histogram()
     expected = torch.cat([descriptor(dataset.batch([i])) for i in range(4)])
@@ -83,7 +86,13 @@ def test_a_name_in_place_of_a_descriptor_is_told(dataset):
 
 
 def test_meshes_come_to_descriptors_that_need_them(dataset):
-    expected = [[dataset.mesh(i).area, dataset[i].signature.area] for i in range(4)]
+    expected = [
+        [
+            dataset.mesh(i).area,
+            dataset[i].signature.area,
+        ]
+        for i in range(4)
+    ]
     found = describe(dataset, Area(), n_workers=1)
     assert_allclose(found, expected, rtol=1e-6)
 
@@ -103,7 +112,10 @@ def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(dataset):
             return self.trained(torch.ones(len(batch), 50))
 
     module = Looking()
-    assert torch.equal(describe(dataset, module, batch_size=2, n_workers=2), torch.ones(4, 50))
+    assert torch.equal(
+        describe(dataset, module, batch_size=2, n_workers=2),
+        torch.ones(4, 50),
+    )
     assert modes == [False] * 6
     assert module.training is True
     assert module.frozen.training is False
@@ -128,7 +140,11 @@ def test_a_descriptor_that_needs_more_refuses(dataset, function):
 def test_what_cannot_be_described_is_listed(dataset):
     area = Area(refused="2.off")
     values, failures = describe_usable(dataset, area, n_workers=1)
-    assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 1, 3)], rtol=1e-6)
+    assert_allclose(
+        values[:, 1],
+        [dataset[i].signature.area for i in (0, 1, 3)],
+        rtol=1e-6,
+    )
     (failure,) = failures
     assert failure.path == dataset.bodies.paths[2]
     assert failure.error == f"{failure.path}: it is not to my liking"
@@ -152,7 +168,11 @@ def test_a_mesh_that_cannot_be_read_is_listed(dataset, tmp_path):
 
 def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset):
     values, failures = describe_usable(dataset, Area(refused="1.off", dies=True), n_workers=2)
-    assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 2, 3)], rtol=1e-6)
+    assert_allclose(
+        values[:, 1],
+        [dataset[i].signature.area for i in (0, 2, 3)],
+        rtol=1e-6,
+    )
     found = [failure.path for failure in failures]
     expected = [dataset.bodies.paths[1]]
     assert found == expected
@@ -162,7 +182,10 @@ def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset):
 def test_descriptions_that_are_not_finite_are_failures(dataset):
     class Broken(Area):
         def describe_body(self, body):
-            return np.array([np.nan if body.id.endswith("0.off") else 1.0], dtype=np.float32)
+            return np.array(
+                [np.nan if body.id.endswith("0.off") else 1.0],
+                dtype=np.float32,
+            )
 
     values, failures = describe_usable(dataset, Broken(), n_workers=1)
     assert values.shape == (3, 1)
@@ -208,7 +231,10 @@ def test_what_has_been_described_is_not_described_again(fresh):
     assert torch.equal(same, values)
     # Of a part, in another order, and beside what is new.
     assert asked(fresh.subset([2, 0]))[0] == []
-    assert torch.equal(asked(fresh.subset([2, 0]))[1], values[[2, 0]])
+    assert torch.equal(
+        asked(fresh.subset([2, 0]))[1],
+        values[[2, 0]],
+    )
 
 
 def test_descriptions_are_kept_by_all_that_they_depend_on(fresh):

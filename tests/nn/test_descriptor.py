@@ -32,7 +32,10 @@ def paper():
 
 
 def learned():
-    axes = [Potential(3, learnable=True), Attribute("depth", [0.2, 0.5, 0.9], learnable=True)]
+    axes = [
+        Potential(3, learnable=True),
+        Attribute("depth", [0.2, 0.5, 0.9], learnable=True),
+    ]
     distances = [InteriorDistance(8, learnable=True), EuclideanDistance(4, learnable=True)]
     return HistogramDescriptor(PairHistogram([*axes, *distances], SpectralEmbedding(n_knots=8)))
 
@@ -73,14 +76,24 @@ def test_padding_never_shows(batch, make):
     with torch.no_grad():
         together = descriptor(batch)
         for i in range(2):
-            assert_close(descriptor(alone(batch, i))[0], together[i], rtol=0, atol=1e-6)
+            assert_close(
+                descriptor(alone(batch, i))[0],
+                together[i],
+                rtol=0,
+                atol=1e-6,
+            )
 
 
 @pytest.mark.parametrize("make", MAKERS)
 def test_does_not_change_with_scale(batch, make):
     descriptor = make()
     with torch.no_grad():
-        assert_close(descriptor(scaled(batch, 8.0)), descriptor(batch), rtol=0, atol=1e-6)
+        assert_close(
+            descriptor(scaled(batch, 8.0)),
+            descriptor(batch),
+            rtol=0,
+            atol=1e-6,
+        )
 
 
 def test_everything_learns(batch):
@@ -107,7 +120,10 @@ def check_gradients(parameters):
 
 def gradients(module, batch, parameters):
     result = module(batch)
-    return result.detach(), *torch.autograd.grad(result.square().sum(), parameters)
+    return result.detach(), *torch.autograd.grad(
+        result.square().sum(),
+        parameters,
+    )
 
 
 def test_compiled_equals_eager(batch):
@@ -146,13 +162,20 @@ def small(n_eigenpairs, n_classes, **options):
     return PairHistogram(axes, SpectralEmbedding(n_eigenpairs=n_eigenpairs), **options)
 
 
-@pytest.mark.parametrize(("shares", "of_first"), [(None, 1 / 2), ([6, 2], 3 / 4)])
+@pytest.mark.parametrize(
+    ("shares", "of_first"),
+    [(None, 1 / 2), ([6, 2], 3 / 4)],
+)
 def test_parts_have_their_shares_and_their_histograms_equal_ones(batch, shares, of_first):
     first, second, third = histograms = [small(3, 2), small(5, 3), small(4, 1)]
     result = HistogramDescriptor([[first, second], third], shares=shares)(batch)
     expected = [
         share * one(batch).flatten(1)
-        for share, one in zip((of_first / 2, of_first / 2, 1 - of_first), histograms, strict=True)
+        for share, one in zip(
+            (of_first / 2, of_first / 2, 1 - of_first),
+            histograms,
+            strict=True,
+        )
     ]
     assert_close(result, torch.cat(expected, dim=1))
     found = result.sum(dim=1)
@@ -203,11 +226,19 @@ def test_training_draws_another_subset_each_time(batch):
     assert not torch.equal(one[:, :first], other[:, :first])
     assert torch.equal(one[:, first:], other[:, first:])
     descriptor.eval()
-    assert_close(descriptor(batch), HistogramDescriptor([small(5, 2), small(5, 1)])(batch))
+    assert_close(
+        descriptor(batch),
+        HistogramDescriptor([small(5, 2), small(5, 1)])(batch),
+    )
 
 
 def test_needs_are_those_of_all_histograms(batch):
-    descriptor = HistogramDescriptor([[small(5, 2), oriented().histograms[0]], small(9, 1)])
+    descriptor = HistogramDescriptor(
+        [
+            [small(5, 2), oriented().histograms[0]],
+            small(9, 1),
+        ]
+    )
     # The embedding of the oriented one takes all that there are.
     assert descriptor.requirements == Requirements(
         9, ("surface_direction",), samples=("interior",), whole_spectrum=True
@@ -228,7 +259,10 @@ def test_needs_are_those_of_all_histograms(batch):
         oriented()(barest)
 
 
-@pytest.mark.parametrize("histograms", [[], [[]], [PairHistogram(), []]])
+@pytest.mark.parametrize(
+    "histograms",
+    [[], [[]], [PairHistogram(), []]],
+)
 def test_no_histogram_is_refused(histograms):
     with pytest.raises(
         ValueError, match="histograms: expected at least one in each part, got none"
@@ -236,7 +270,10 @@ def test_no_histogram_is_refused(histograms):
         HistogramDescriptor(histograms)
 
 
-@pytest.mark.parametrize("shares", [[1.0], [1.0, 0.0], [1.0, float("nan")]])
+@pytest.mark.parametrize(
+    "shares",
+    [[1.0], [1.0, 0.0], [1.0, float("nan")]],
+)
 def test_each_part_needs_a_positive_share(shares):
     with pytest.raises(ValueError, match="shares: expected a positive number for each of 2 parts"):
         HistogramDescriptor([PairHistogram(), PairHistogram()], shares=shares)
@@ -252,7 +289,14 @@ class Extent(BodyDescriptor):
         assert body.mesh is body.surface_mesh
         points = body.interior.points
         functions = body.interior.eigenfunctions
-        return np.array([len(points), functions.shape[1], np.abs(points).max(), body.area])
+        return np.array(
+            [
+                len(points),
+                functions.shape[1],
+                np.abs(points).max(),
+                body.area,
+            ]
+        )
 
 
 def test_a_descriptor_of_bodies_sees_each_without_padding(batch):
@@ -262,7 +306,12 @@ def test_a_descriptor_of_bodies_sees_each_without_padding(batch):
     described = descriptor(replace(batch, meshes=(object(), object())))
     assert described.dtype == torch.float32
     largest = [float(batch.interior.points[i].abs().max()) for i in range(2)]
-    expected = torch.tensor([[40, 12, largest[0], 2], [25, 7, largest[1], 3]])
+    expected = torch.tensor(
+        [
+            [40, 12, largest[0], 2],
+            [25, 7, largest[1], 3],
+        ]
+    )
     assert_close(described, expected)
 
 
@@ -283,7 +332,12 @@ def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch):
     assert descriptor.requirements == below.requirements
     embedding = descriptor(batch)
     roots = below(batch).sqrt() - below(batch).sqrt().mean(dim=0)
-    assert_close(embedding, roots / roots.norm(dim=1, keepdim=True), atol=1e-5, rtol=0)
+    assert_close(
+        embedding,
+        roots / roots.norm(dim=1, keepdim=True),
+        atol=1e-5,
+        rtol=0,
+    )
     assert_close(descriptor.distances(embedding, embedding), cosine(embedding, embedding))
     assert descriptor.shorten(embedding) is embedding
     with pytest.raises(
@@ -305,7 +359,10 @@ def test_coordinates_of_histograms_are_their_roots(batch):
     assert kept.coordinates(histograms.flatten(1)).equal(histograms.flatten(1))
 
 
-@pytest.mark.parametrize("given", ["body.off", torch.zeros(3), two_bodies()[0]])
+@pytest.mark.parametrize(
+    "given",
+    ["body.off", torch.zeros(3), two_bodies()[0]],
+)
 def test_what_is_no_batch_is_refused_with_the_remedy(given):
     with pytest.raises(TypeError, match=r"batch: expected a SignatureBatch, got .*igps.collate"):
         HistogramDescriptor(PairHistogram())(given)

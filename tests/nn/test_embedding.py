@@ -26,7 +26,12 @@ def learned():
     module = SpectralEmbedding(n_knots=9)
     assert module.log_gain is not None
     with torch.no_grad():
-        module.log_gain.copy_(torch.randn(9, generator=torch.Generator().manual_seed(1)))
+        module.log_gain.copy_(
+            torch.randn(
+                9,
+                generator=torch.Generator().manual_seed(1),
+            )
+        )
     return module
 
 
@@ -41,7 +46,12 @@ def test_does_not_change_with_scale(spectrum, is_learned):
     module = learned() if is_learned else SpectralEmbedding()
     scale = 7.0
     scaled = module(
-        functions / scale, values / scale**2, torch.tensor(AREA * scale**2, dtype=torch.float64)
+        functions / scale,
+        values / scale**2,
+        torch.tensor(
+            AREA * scale**2,
+            dtype=torch.float64,
+        ),
     )
     expected = module(functions, values, torch.tensor(AREA, dtype=torch.float64))
     torch.testing.assert_close(scaled, expected, rtol=1e-9, atol=0)
@@ -61,7 +71,10 @@ def test_padding_has_no_weight(spectrum, is_learned):
     assert (module.weights(padded_values, area)[1, 5:] == 0).all()
     assert (result[1, :, 5:] == 0).all()
     assert torch.equal(result[0], module(functions, values, area[0]))
-    assert torch.equal(result[1, :, :5], module(functions[:, :5], values[:5], area[1]))
+    assert torch.equal(
+        result[1, :, :5],
+        module(functions[:, :5], values[:5], area[1]),
+    )
     if is_learned:
         result.square().sum().backward()
         assert torch.isfinite(module.log_gain.grad).all()
@@ -73,7 +86,11 @@ def test_keeps_the_first_eigenpairs(spectrum):
     area = torch.tensor(AREA)
     for module in (SpectralEmbedding(n_eigenpairs=4), SpectralEmbedding(n_eigenpairs=4, n_knots=3)):
         assert torch.equal(
-            module(functions, values, area), commute_time_embedding(functions[:, :4], values[:4])
+            module(functions, values, area),
+            commute_time_embedding(
+                functions[:, :4],
+                values[:4],
+            ),
         )
     assert torch.equal(
         spectral_embedding(functions, values, n_eigenpairs=4), module(functions, values, area)
@@ -95,7 +112,11 @@ def test_learned_filter_interpolates_its_knots_in_log():
     gain = module.log_gain.detach().double().numpy()
     x = np.geomspace(0.5, 20_000, 333)
     expected = x**-0.5 * np.exp(
-        np.interp(np.log(x), np.linspace(math.log(2), math.log(5000), 9), gain)
+        np.interp(
+            np.log(x),
+            np.linspace(math.log(2), math.log(5000), 9),
+            gain,
+        )
     )
     weights = module.weights(torch.from_numpy(x), torch.tensor(1.0)).detach()
     np.testing.assert_allclose(weights, expected, rtol=1e-6)

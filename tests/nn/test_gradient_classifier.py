@@ -37,7 +37,11 @@ def trained(model):
 
 def test_a_sequence_with_a_linear_layer_trains():
     descriptor = learnable()
-    model = nn.Sequential(descriptor, nn.Flatten(), nn.Linear(descriptor.n_features, 2))
+    model = nn.Sequential(
+        descriptor,
+        nn.Flatten(),
+        nn.Linear(descriptor.n_features, 2),
+    )
     assert descriptor.n_features == 6 * 7
     before = [one.clone() for one in descriptor.parameters()]
     assert trained(model) < 0.95

@@ -21,7 +21,13 @@ def batch():
     for name in ("interior", "rich", "pretrained"):
         config = igps.descriptor(name).requirements.apply_to(config)
     vertices, faces = bumpy_sphere(3)
-    bodies = [igps.Mesh(vertices * [stretch, 1, 1], faces) for stretch in (1, 2)]
+    bodies = [
+        igps.Mesh(
+            vertices * [stretch, 1, 1],
+            faces,
+        )
+        for stretch in (1, 2)
+    ]
     return igps.collate([igps.compute_signature(body, config) for body in bodies])
 
 

@@ -185,7 +185,12 @@ def test_a_head_in_closed_form_follows_the_bins(shapes, tmp_path, validated):
     assert cells == (3 * 16, 9)
     expected = WhitenedHead(4).fit(describe(part, model.descriptor), part.labels, cells)
     for name, value in expected.state_dict().items():
-        assert_close(model.distance.head.state_dict()[name].abs(), value.abs(), atol=1e-4, rtol=0)
+        assert_close(
+            model.distance.head.state_dict()[name].abs(),
+            value.abs(),
+            atol=1e-4,
+            rtol=0,
+        )
 
 
 @pytest.mark.parametrize("make", [ProjectionHead, WhitenedHead, KernelHead])
@@ -224,7 +229,12 @@ def test_any_loader_of_labelled_batches_trains(items, tmp_path, make):
         assert len(fitted.mean) == 48
         assert (fitted.mean > 0).any()
     else:
-        assert_close(fitted.mean, descriptions.flatten(1).sqrt().mean(dim=0), atol=1e-6, rtol=1e-4)
+        assert_close(
+            fitted.mean,
+            descriptions.flatten(1).sqrt().mean(dim=0),
+            atol=1e-6,
+            rtol=1e-4,
+        )
     # Both parts of the distance on the scale of the training shapes.
     pairs = torch.triu_indices(len(items), len(items), 1).unbind()
     plain = chi_square(descriptions, descriptions)[pairs].median()
@@ -356,14 +366,20 @@ def test_bodies_of_unknown_classes_are_refused(items, tmp_path):
     """As −1 all would be of one class, and every score the best."""
     unknown = [replace(item, label=-1) for item in items]
     with pytest.raises(ValueError, match="labels: expected the class of each body, got −1"):
-        trainer(1, tmp_path).fit(learner(), loader([*items[:-1], unknown[-1]]))
+        trainer(1, tmp_path).fit(
+            learner(),
+            loader([*items[:-1], unknown[-1]]),
+        )
     with pytest.raises(ValueError, match="query_labels: expected known classes, got −1"):
         trainer(1, tmp_path).test(learner(), loader(unknown), verbose=False)
 
 
 def test_several_training_loaders_are_refused(items, tmp_path):
     with pytest.raises(ValueError, match="train_dataloaders: expected one DataLoader, got list"):
-        trainer(1, tmp_path).fit(learner(), [loader(items), loader(items)])
+        trainer(1, tmp_path).fit(
+            learner(),
+            [loader(items), loader(items)],
+        )
 
 
 def test_without_head_the_test_scores_are_the_plain_ones(shapes, tmp_path):
@@ -386,7 +402,10 @@ def test_a_repeated_shape_counts_once(shapes, tmp_path):
     module = data(shapes)
     model = RetrievalLearner(bins(), BlendedDistance(), loss=torch.nn.Identity())
     (once,) = trainer(1, tmp_path).test(model, module, verbose=False)
-    module.split = replace(module.split, test=(*module.split.test, *module.split.test[:2]))
+    module.split = replace(
+        module.split,
+        test=(*module.split.test, *module.split.test[:2]),
+    )
     (repeated,) = trainer(1, tmp_path).test(model, module, verbose=False)
     assert repeated == once
 

@@ -67,7 +67,11 @@ def test_the_whole_graph_is_traced(module):
     torch.compiler.reset()
     traced = torch.compile(module, backend="aot_eager", fullgraph=True)
     assert_close(traced(batch), module(batch), rtol=0, atol=1e-6)
-    for found, expected in zip(gradients(traced, batch), gradients(module, batch), strict=True):
+    for found, expected in zip(
+        gradients(traced, batch),
+        gradients(module, batch),
+        strict=True,
+    ):
         assert_close(found, expected, rtol=1e-4, atol=1e-7)
 
 
@@ -134,7 +138,12 @@ def test_double_precision_stays_double(module):
     result = module.double()(two_bodies().to(torch.float64))
     assert result.dtype == torch.float64
     assert_close(result.detach(), single.double(), rtol=0, atol=1e-5)
-    assert_close(result.flatten(1).sum(dim=1).detach(), torch.ones(2).double(), rtol=0, atol=1e-12)
+    assert_close(
+        result.flatten(1).sum(dim=1).detach(),
+        torch.ones(2).double(),
+        rtol=0,
+        atol=1e-12,
+    )
 
 
 def test_transforms_of_functions_follow_a_histogram(module):
@@ -153,7 +162,10 @@ def test_transforms_of_functions_follow_a_histogram(module):
     found = torch.func.grad(loss)(batch.area)
     assert_close(found, expected)
     direction = torch.tensor([1.0, -2.0]).double()
-    assert_close(torch.func.jvp(loss, (batch.area,), (direction,))[1], expected @ direction)
+    assert_close(
+        torch.func.jvp(loss, (batch.area,), (direction,))[1],
+        expected @ direction,
+    )
     with forward_ad.dual_level():
         along = forward_ad.unpack_dual(loss(forward_ad.make_dual(batch.area, direction))).tangent
         assert_close(torch.zeros(()).double() if along is None else along, expected @ direction)
@@ -256,6 +268,14 @@ def test_functions_stand_beside_the_modules():
     found = functional.pair_histogram(embedding, functional.barycentroid_potential(embedding))
     expected = PairHistogram()(batch)[1]
     assert_close(found, expected, rtol=0, atol=1e-6)
-    assert float(functional.chi_square(found[None].flatten(1), found[None].flatten(1))) == 0
+    assert (
+        float(
+            functional.chi_square(
+                found[None].flatten(1),
+                found[None].flatten(1),
+            )
+        )
+        == 0
+    )
     for name in functional.__all__:
         assert callable(getattr(functional, name))

@@ -62,7 +62,10 @@ def kernels():
     generator = torch.Generator().manual_seed(0)
     embedding = torch.randn(300, 64, generator=generator) / 8
     points = torch.rand(300, 3, generator=generator)
-    directions = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator), dim=1)
+    directions = torch.nn.functional.normalize(
+        torch.randn(300, 3, generator=generator),
+        dim=1,
+    )
     memberships = torch.rand(300, 2, generator=generator).softmax(dim=1)
     centres = torch.linspace(0.1, 2.5, 30)
     leaf = embedding.clone().requires_grad_()

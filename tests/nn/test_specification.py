@@ -105,7 +105,11 @@ def test_trained_parameters_and_what_is_shared_come_back(tmp_path):
 def test_a_fitted_head_comes_back_with_its_sizes(tmp_path):
     histograms = torch.rand(6, 4, generator=torch.Generator().manual_seed(1))
     histograms /= histograms.sum(dim=1, keepdim=True)
-    head = WhitenedHead(2).fit(histograms, torch.tensor([0, 0, 1, 1, 2, 2]), (1, 3))
+    head = WhitenedHead(2).fit(
+        histograms,
+        torch.tensor([0, 0, 1, 1, 2, 2]),
+        (1, 3),
+    )
     base = HistogramDescriptor(PairHistogram([EuclideanDistance(4)]))
     EmbeddedDescriptor(base, head, name="mine").save(tmp_path / "mine.safetensors")
     found = igps.load(tmp_path / "mine.safetensors")
@@ -207,7 +211,12 @@ def test_a_hostile_file_is_refused_in_a_sentence(what, tmp_path):
 
 @pytest.mark.parametrize(
     ("parameter", "shape"),
-    [("temperature", (2,)), ("members", (2,)), ("coefficients", (3, 7)), ("whitened.mean", (3,))],
+    [
+        ("temperature", (2,)),
+        ("members", (2,)),
+        ("coefficients", (3, 7)),
+        ("whitened.mean", (3,)),
+    ],
 )
 def test_a_head_whose_sizes_do_not_fit_is_refused(parameter, shape, tmp_path):
     """Else it shows when all bodies are described, and not which file is at fault."""
@@ -215,7 +224,12 @@ def test_a_head_whose_sizes_do_not_fit_is_refused(parameter, shape, tmp_path):
     histograms = torch.rand(6, 4, generator=torch.Generator().manual_seed(1))
     base = HistogramDescriptor(PairHistogram([EuclideanDistance(4)]))
     model = EmbeddedDescriptor(
-        base, ClassifierHead().fit(histograms, torch.tensor([0, 0, 1, 1, 2, 2])), name="mine"
+        base,
+        ClassifierHead().fit(
+            histograms,
+            torch.tensor([0, 0, 1, 1, 2, 2]),
+        ),
+        name="mine",
     )
     model.save(path)
     assert torch.equal(

@@ -51,7 +51,14 @@ def worst_by_a_loop(distances, labels, names):
         before = range(1, rank) if rank > 1 else range(1, n_right + 1)
         wrong = [place for place in before if labels[others[place - 1]] != label]
         found.append(
-            ((-rank, tier, names[query]), {"query": query, "rank": rank, "wrong": wrong[:3]})
+            (
+                (-rank, tier, names[query]),
+                {
+                    "query": query,
+                    "rank": rank,
+                    "wrong": wrong[:3],
+                },
+            )
         )
     return [one for _, one in sorted(found, key=lambda pair: pair[0])][:20]
 

@@ -24,7 +24,10 @@ def worst_of(distances, labels, names):
 
 
 @pytest.mark.parametrize("spread", [1.0, 4.0, 8.0, 30.0])
-@pytest.mark.parametrize(("n", "n_classes"), [(12, 3), (60, 5), (90, 40)])
+@pytest.mark.parametrize(
+    ("n", "n_classes"),
+    [(12, 3), (60, 5), (90, 40)],
+)
 def test_the_worst_are_those_of_a_loop(n, n_classes, spread):
     """From almost nothing wrong to chance; names in an order of their own; of 40 classes some have one shape."""
     distances, labels = random_collection(n, n_classes, spread, seed=n)
@@ -37,7 +40,11 @@ def test_a_wrong_nearest_comes_before_a_right_one():
     names = ("a0", "a1", "a2", "b0", "b1")
     labels = ("a", "a", "a", "b", "b")
     places = np.array([0.0, 1.0, 5.0, 2.5, 9.0])
-    found = worst_of(np.abs(places[:, None] - places[None]).astype(np.float32), labels, names)
+    found = worst_of(
+        np.abs(places[:, None] - places[None]).astype(np.float32),
+        labels,
+        names,
+    )
     # b0 finds a1, a0 and a2 (2.5 both, in this order), then b1; b1 finds a2 (4), then b0; a2 finds b0, then a1.
     assert found == [
         {"query": 3, "rank": 4, "wrong": [1, 2, 3]},
@@ -64,7 +71,11 @@ def test_each_descriptor_has_its_own(tmp_path):
     systems = data_of(read_results(comparison_folder(tmp_path / "compare")), {})["systems"]
     for seed, system in enumerate(systems):
         n = len(NAMES) - seed
-        expected = worst_by_a_loop(distances_of(seed)[:n, :n], LABELS[:n], NAMES[:n])
+        expected = worst_by_a_loop(
+            distances_of(seed)[:n, :n],
+            LABELS[:n],
+            NAMES[:n],
+        )
         assert system["worst"] == expected
     assert systems[0]["worst"] != systems[1]["worst"]
     for labels in ((), NAMES):
@@ -78,7 +89,16 @@ def test_numbers_are_those_of_all_shapes():
     """Of a descriptor that does not describe the first mesh."""
     distances, labels = random_collection(12, 3, 8.0, seed=3)
     names = tuple(f"{i:02d}" for i in range(12))
-    system = System("any", names[1:], labels[1:], torch.from_numpy(distances[1:, 1:]))
+    system = System(
+        "any",
+        names[1:],
+        labels[1:],
+        torch.from_numpy(distances[1:, 1:]),
+    )
     (made,) = data_of(Results("compare", names, labels, (system,)), {})["systems"]
-    expected = worst_by_a_loop(distances[1:, 1:], labels[1:], names[1:])
+    expected = worst_by_a_loop(
+        distances[1:, 1:],
+        labels[1:],
+        names[1:],
+    )
     assert made["worst"] == [{**one, "query": one["query"] + 1} for one in expected]

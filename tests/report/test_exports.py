@@ -83,6 +83,10 @@ def test_vtk_reads_the_surface_and_its_values(exported):
 
 def test_nothing_is_claimed_about_a_body_without_a_frame(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=2)
-    write_places(tmp_path / "s.1", Mesh(ball.vertices, ball.faces), {"value": np.ones(162)})
+    write_places(
+        tmp_path / "s.1",
+        Mesh(ball.vertices, ball.faces),
+        {"value": np.ones(162)},
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s.1.ply", "s.1.vtk"]
     assert b"RAS" not in (tmp_path / "s.1.ply").read_bytes()[:200]

@@ -85,11 +85,20 @@ def test_rankings_and_scores_are_those_of_a_loop(tmp_path):
     n = len(NAMES)
     assert system["shapes"] == list(range(n))
     assert system["top"] == n - 1
-    ranked = np.frombuffer(base64.b64decode(system["ranked"]), "<u4").reshape(n, n - 1)
-    told = np.frombuffer(base64.b64decode(system["distances"]), "<f4").reshape(n, n - 1)
+    ranked = np.frombuffer(base64.b64decode(system["ranked"]), "<u4").reshape(
+        n,
+        n - 1,
+    )
+    told = np.frombuffer(base64.b64decode(system["distances"]), "<f4").reshape(
+        n,
+        n - 1,
+    )
     nearest, tier = np.zeros((2, 3, 3), dtype=int)
     for i in range(n):
-        order = sorted((j for j in range(n) if j != i), key=lambda j: distances[i, j])
+        order = sorted(
+            (j for j in range(n) if j != i),
+            key=lambda j: distances[i, j],
+        )
         assert ranked[i].tolist() == order
         np.testing.assert_array_equal(told[i], distances[i, order])
         of = data["classes"].index
@@ -203,10 +212,16 @@ def test_classes_of_two_have_the_scores_of_a_single_answer(tmp_path):
     distances = distances_of(0)
     ranks = []
     for i in range(6):
-        order = sorted((j for j in range(7) if j != i), key=lambda j: (distances[i, j], j))
+        order = sorted(
+            (j for j in range(7) if j != i),
+            key=lambda j: (distances[i, j], j),
+        )
         ranks.append(1 + order.index(i ^ 1))
     assert system["per_query"]["rank"] == [*ranks, None]
-    assert system["scores"]["nn"] == pytest.approx(np.mean(np.equal(ranks, 1)), abs=1e-5)
+    assert system["scores"]["nn"] == pytest.approx(
+        np.mean(np.equal(ranks, 1)),
+        abs=1e-5,
+    )
     assert system["scores"]["median_rank"] == np.sort(ranks)[2]
     assert system["curve"] is system["per_class"] is None
     titles = [attributes.get("title", "") for tag, attributes in seen.elements if tag == "abbr"]

@@ -67,7 +67,11 @@ def browser():
 def folder(tmp_path_factory):
     """A page of each kind of results."""
     body = icosphere(subdivisions=3)
-    body.vertices *= [1.0, 0.6 + 0.3 * (body.vertices[:, 2] > 0).mean(), 2.2]
+    body.vertices *= [
+        1.0,
+        0.6 + 0.3 * (body.vertices[:, 2] > 0).mean(),
+        2.2,
+    ]
     mesh = as_mesh(body)
     root = tmp_path_factory.mktemp("pages")
     pictures = surfaces(mesh)
@@ -184,7 +188,15 @@ def places_on_the_map(visit):
     """(N, 2) centres of the points on the screen."""
     visit.page.locator("#map-plot").scroll_into_view_if_needed()
     boxes = [visit.page.locator(f'[data-point="{i}"]').bounding_box() for i in range(len(NAMES))]
-    return np.array([[box["x"] + box["width"] / 2, box["y"] + box["height"] / 2] for box in boxes])
+    return np.array(
+        [
+            [
+                box["x"] + box["width"] / 2,
+                box["y"] + box["height"] / 2,
+            ]
+            for box in boxes
+        ]
+    )
 
 
 def selected(visit):
@@ -202,7 +214,10 @@ def test_the_map_has_the_places_of_the_distances_and_tells_the_one_under_the_mou
     expected = pytest.approx(scale * np.diff(points[:, 0]), abs=1)
     assert found == expected
     found = np.diff(places[:, 1])
-    expected = pytest.approx(-scale * np.diff(points[:, 1]), abs=1)
+    expected = pytest.approx(
+        -scale * np.diff(points[:, 1]),
+        abs=1,
+    )
     assert found == expected
     answers.page.mouse.move(*places[1])
     tip = answers.page.locator("#map-tip")
@@ -315,7 +330,10 @@ def test_the_tree_joins_what_is_near_and_selects_what_lies_under_a_branch(answer
         assert faint == set(range(len(NAMES))) - members
     lowest, (pair, _) = branches[0], expected[0]
     box = lowest.bounding_box()
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.click(
+        box["x"] + box["width"] / 2,
+        box["y"] + box["height"] / 2,
+    )
     assert selected(answers) == pair
     walked = [lowest.get_attribute("aria-label")]
     while page.evaluate("document.activeElement.getAttribute('aria-label')") != branches[
@@ -455,7 +473,10 @@ def test_a_click_shows_the_ranking(retrieval):
     query = 3
     distances = distances_of(0)
     dialog = retrieval.open(query)
-    order = sorted((j for j in range(len(NAMES)) if j != query), key=lambda j: distances[query, j])
+    order = sorted(
+        (j for j in range(len(NAMES)) if j != query),
+        key=lambda j: distances[query, j],
+    )
     cards = dialog.locator("#ranking-list .shape")
     found = cards.locator(".name").all_inner_texts()
     expected = [NAMES[j] for j in order]
@@ -609,7 +630,10 @@ def test_another_descriptor_ranks_otherwise(browser, folder):
             distances = distances_of(seed)[: len(NAMES) - seed, : len(NAMES) - seed]
             dialog = visit.open(query)
             found[name] = dialog.locator("#ranking-list .name").all_inner_texts()
-            order = sorted(range(1, len(distances)), key=lambda j: distances[query, j])
+            order = sorted(
+                range(1, len(distances)),
+                key=lambda j: distances[query, j],
+            )
             assert found[name] == [NAMES[j] for j in order]
             page.locator("#close").click()
         assert found["interior"] != found["gps"]
@@ -687,7 +711,11 @@ def test_without_confusions_the_page_says_so(browser, tmp_path):
     """All right by the first descriptor, and the second describes one shape of each class."""
     results = comparison_folder(tmp_path / "compare")
     right = np.array([[float(one != other) for other in LABELS] for one in LABELS])
-    for name, some in zip(DESCRIPTORS, (list(range(len(NAMES))), [0, 3]), strict=True):
+    for name, some in zip(
+        DESCRIPTORS,
+        (list(range(len(NAMES))), [0, 3]),
+        strict=True,
+    ):
         np.savez_compressed(
             results / "distances" / f"{name}.npz",
             distances=right[np.ix_(some, some)],

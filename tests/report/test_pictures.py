@@ -59,7 +59,10 @@ def test_the_potential_is_that_of_the_nearest_samples():
     for vertex in range(
         0, len(mesh.vertices), 50
     ):  # small enough: the vertices are those of the mesh
-        away = np.linalg.norm(signature.surface.points - mesh.vertices[vertex], axis=1)
+        away = np.linalg.norm(
+            signature.surface.points - mesh.vertices[vertex],
+            axis=1,
+        )
         total = weights = 0.0
         for sample in np.argsort(away)[:4]:
             phi = signature.surface.eigenfunctions[sample].astype(float)
@@ -77,9 +80,20 @@ def test_turned_and_moved_bodies_look_alike():
         :3, :3
     ]
     other = as_mesh(
-        trimesh.Trimesh(3 * mesh.vertices @ turn.T + [5, 1, 2], mesh.faces, process=False)
+        trimesh.Trimesh(
+            3 * mesh.vertices @ turn.T + [5, 1, 2],
+            mesh.faces,
+            process=False,
+        )
     )
-    one, two = (surface_of(body, compute_signature(body, CONFIG), 1000) for body in (mesh, other))
+    one, two = (
+        surface_of(
+            body,
+            compute_signature(body, CONFIG),
+            1000,
+        )
+        for body in (mesh, other)
+    )
     np.testing.assert_allclose(one.vertices / 65535, two.vertices / 65535, atol=2e-3)
 
 

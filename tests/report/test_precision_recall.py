@@ -19,7 +19,11 @@ def test_curves_are_drawn_in_percent_and_told_apart(tmp_path, figures_of):
     figures.precision_recall(curves, tmp_path / "deep" / "curves.png")
     (axes,) = made[0].axes
     assert len(axes.lines) == 12
-    for line, (name, curve) in zip(axes.lines, curves.items(), strict=True):
+    for line, (name, curve) in zip(
+        axes.lines,
+        curves.items(),
+        strict=True,
+    ):
         assert line.get_label() == name
         np.testing.assert_allclose(line.get_xdata(), 100 * curve.recall)
         np.testing.assert_allclose(line.get_ydata(), 100 * curve.precision)

@@ -15,7 +15,11 @@ nibabel = pytest.importorskip("nibabel")
 SimpleITK = pytest.importorskip("SimpleITK")
 
 CENTRE = np.array([30.0, -40.0, 200.0])
-MARKS = {"L": [-1.0, 0, 0], "A": [0, 1.0, 0], "S": [0, 0, 1.0]}
+MARKS = {
+    "L": [-1.0, 0, 0],
+    "A": [0, 1.0, 0],
+    "S": [0, 0, 1.0],
+}
 ORIENTATIONS = {
     "RAS": np.eye(3),
     "LAS": np.diag([-1.0, 1, 1]),
@@ -56,7 +60,11 @@ def nearest_letter(view, point):
     at_viewer = {**side, "from above": "S", "from below": "I"}[view.title]
     far = dict(zip("LRAPSI", "RLPAIS", strict=True))[at_viewer]
     sizes = {at_viewer: toward, far: -toward}
-    for letter, size in zip(view.letters, (-right, right, -up, up), strict=True):
+    for letter, size in zip(
+        view.letters,
+        (-right, right, -up, up),
+        strict=True,
+    ):
         sizes[letter] = size
     assert sorted(sizes) == list("AILPRS")
     return max(sizes, key=lambda letter: sizes[letter])
@@ -84,7 +92,11 @@ def test_pixels_of_a_mark_on_the_left_are_at_the_letter_l(tmp_path):
     mesh = load_mesh(path)
     views, (vertices,) = common_views([mesh])
     is_mark = mesh.vertices[:, 0] < CENTRE[0] - 14
-    colours = np.where(is_mark[:, None], [1.0, 0, 0], [0, 0, 1.0])
+    colours = np.where(
+        is_mark[:, None],
+        [1.0, 0, 0],
+        [0, 0, 1.0],
+    )
     for view in views[0], views[2]:  # from the front, and from behind
         figure = drawing.new_figure(3, 3)
         axes = figure.add_subplot()
@@ -121,8 +133,14 @@ def test_bodies_without_a_frame_are_turned_onto_the_first_and_not_mirrored():
     body.vertices += 0.9 * np.exp(-np.square(body.vertices - [2.0, 1.0, 0.5]).sum(axis=1))[:, None]
     first = as_mesh(body)
     turn = Rotation.from_euler("xyz", [100, 40, -70], degrees=True).as_matrix()
-    turned = Mesh(first.vertices @ turn.T + [5.0, -3, 2], first.faces)
-    mirrored = Mesh(turned.vertices * [-1, 1, 1], turned.faces[:, ::-1])
+    turned = Mesh(
+        first.vertices @ turn.T + [5.0, -3, 2],
+        first.faces,
+    )
+    mirrored = Mesh(
+        turned.vertices * [-1, 1, 1],
+        turned.faces[:, ::-1],
+    )
     views, (own, moved, other) = common_views([first, turned, mirrored])
     found = [view.title for view in views]
     expected = [f"view {number}" for number in range(1, 7)]
@@ -131,7 +149,11 @@ def test_bodies_without_a_frame_are_turned_onto_the_first_and_not_mirrored():
         assert view.letters == ()
     np.testing.assert_allclose(moved, own, atol=0.02)
     assert norm(other - own, axis=1).max() > 0.3
-    motion = np.linalg.lstsq(mirrored.vertices - mirrored.vertices.mean(axis=0), other, rcond=None)
+    motion = np.linalg.lstsq(
+        mirrored.vertices - mirrored.vertices.mean(axis=0),
+        other,
+        rcond=None,
+    )
     assert np.linalg.det(motion[0]) > 0
 
 

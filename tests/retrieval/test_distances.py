@@ -31,22 +31,41 @@ def either_device(request, monkeypatch):
 def histograms(n, cells, *, seed, filled=0.6):
     """Random float64 histograms that sum to 1, a share of their cells empty."""
     generator = torch.Generator().manual_seed(seed)
-    values = torch.rand(n, *cells, generator=generator, dtype=torch.float64)
+    values = torch.rand(
+        n,
+        *cells,
+        generator=generator,
+        dtype=torch.float64,
+    )
     values *= torch.rand(n, *cells, generator=generator) < filled
     return values / values.flatten(1).sum(1).view(n, *[1] * len(cells))
 
 
 @pytest.mark.usefixtures("either_device")
 @pytest.mark.parametrize("distance", ALL)
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 4e-6)])
 @pytest.mark.parametrize(
-    ("n_queries", "n_gallery", "cells"), [(7, 5, (3, 8)), (1, 90, (10, 64)), (3, 2, (9000,))]
+    ("dtype", "tolerance"),
+    [(torch.float64, 1e-12), (torch.float32, 4e-6)],
+)
+@pytest.mark.parametrize(
+    ("n_queries", "n_gallery", "cells"),
+    [
+        (7, 5, (3, 8)),
+        (1, 90, (10, 64)),
+        (3, 2, (9000,)),
+    ],
 )
 def test_agrees_with_another_library(distance, dtype, tolerance, n_queries, n_gallery, cells):
     queries = histograms(n_queries, cells, seed=1)
     gallery = histograms(n_gallery, cells, seed=2)
-    expected = ORACLES[distance](queries.flatten(1).numpy(), gallery.flatten(1).numpy())
-    result = distance(queries.to(dtype), gallery.to(dtype))
+    expected = ORACLES[distance](
+        queries.flatten(1).numpy(),
+        gallery.flatten(1).numpy(),
+    )
+    result = distance(
+        queries.to(dtype),
+        gallery.to(dtype),
+    )
     assert result.shape == (n_queries, n_gallery)
     assert result.dtype == dtype
     found = result.double().numpy()
@@ -58,7 +77,10 @@ def test_agrees_with_another_library(distance, dtype, tolerance, n_queries, n_ga
 def test_a_set_with_itself_has_a_zero_diagonal_and_is_symmetric(distance):
     shapes = histograms(60, (10, 64), seed=3).float()
     distances = distance(shapes, shapes.clone())
-    assert torch.equal(distances.diagonal(), torch.zeros(60))
+    assert torch.equal(
+        distances.diagonal(),
+        torch.zeros(60),
+    )
     assert torch.equal(distances, distances.T)
     assert (distances >= 0).all()
 
@@ -66,7 +88,10 @@ def test_a_set_with_itself_has_a_zero_diagonal_and_is_symmetric(distance):
 def test_near_vectors_keep_their_cosine_distance():
     angle = 1e-3
     a = torch.tensor([[1.0, 0.0]])
-    b = torch.tensor([[np.cos(angle), np.sin(angle)]], dtype=torch.float32)
+    b = torch.tensor(
+        [[np.cos(angle), np.sin(angle)]],
+        dtype=torch.float32,
+    )
     # 1 − cos in float32 would be 6 % off
     found = cosine(a, b).item()
     expected = pytest.approx(angle**2 / 2, rel=1e-4)
@@ -93,8 +118,16 @@ def test_threads_change_no_bit(distance, many_cores, monkeypatch):
             found.append(distance(queries, gallery))
     assert torch.equal(found[1], found[0])
     assert torch.equal(found[2], found[0])
-    expected = ORACLES[distance](queries.numpy(), gallery.numpy())
-    assert_allclose(found[0].numpy(), expected, rtol=0, atol=1e-12)
+    expected = ORACLES[distance](
+        queries.numpy(),
+        gallery.numpy(),
+    )
+    assert_allclose(
+        found[0].numpy(),
+        expected,
+        rtol=0,
+        atol=1e-12,
+    )
 
 
 @pytest.mark.usefixtures("either_device")
@@ -106,7 +139,10 @@ def test_chi_square_of_tiny_entries_does_not_underflow():
 def test_half_precision_is_computed_in_float32():
     queries = histograms(4, (5, 8), seed=4).half()
     for distance in ALL:
-        expected = distance(queries.float(), queries[:2].float())
+        expected = distance(
+            queries.float(),
+            queries[:2].float(),
+        )
         assert_close(distance(queries, queries[:2]), expected)
 
 
@@ -141,12 +177,23 @@ def test_gradients_agree_with_finite_differences(distance):
 @pytest.mark.parametrize("distance", ALL)
 @pytest.mark.parametrize("side", [0, 1])
 def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(distance, side):
-    both = [histograms(3, (40,), seed=25), histograms(2, (40,), seed=26)]
+    both = [
+        histograms(3, (40,), seed=25),
+        histograms(2, (40,), seed=26),
+    ]
     both[1][1] = both[0][2]  # at distance zero
-    along = histograms(len(both[side]), (40,), seed=29, filled=2)
+    along = histograms(
+        len(both[side]),
+        (40,),
+        seed=29,
+        filled=2,
+    )
     upstream = histograms(3, (2,), seed=30, filled=2)
     leaf = both[side].requires_grad_()
-    [gradient] = grad((distance(*both) * upstream).sum(), leaf)
+    [gradient] = grad(
+        (distance(*both) * upstream).sum(),
+        leaf,
+    )
     expected = (gradient * along).sum()
 
     def of_side(rows):
@@ -179,13 +226,25 @@ def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_diffe
 def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula():
     queries = histograms(40, (9000,), seed=10, filled=2)
     gallery = histograms(30, (9000,), seed=11, filled=2)
-    upstream = torch.rand(40, 30, generator=torch.Generator().manual_seed(13), dtype=torch.float64)
+    upstream = torch.rand(
+        40,
+        30,
+        generator=torch.Generator().manual_seed(13),
+        dtype=torch.float64,
+    )
     arguments = [tensor.requires_grad_() for tensor in (queries, gallery)]
-    gradients = grad((chi_square(*arguments) * upstream).sum(), arguments)
+    gradients = grad(
+        (chi_square(*arguments) * upstream).sum(),
+        arguments,
+    )
     a = queries[:, None]
     b = gallery[None]
     plain = ((a - b) ** 2 / (a + b)).sum(-1) / 2
-    for ours, expected in zip(gradients, grad((plain * upstream).sum(), arguments), strict=True):
+    for ours, expected in zip(
+        gradients,
+        grad((plain * upstream).sum(), arguments),
+        strict=True,
+    ):
         assert_close(ours, expected, rtol=1e-9, atol=1e-12)
 
 
@@ -194,8 +253,17 @@ def test_chi_square_has_second_derivatives_and_none_at_empty_cells():
     gallery = histograms(4, (6,), seed=28, filled=2)
     leaves = [one.requires_grad_() for one in (queries, gallery)]
     assert torch.autograd.gradgradcheck(chi_square, leaves)
-    empty = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
-    [first] = grad(chi_square(empty, torch.zeros(1, 2).double()).sum(), empty, create_graph=True)
+    empty = torch.zeros(
+        1,
+        2,
+        dtype=torch.float64,
+        requires_grad=True,
+    )
+    [first] = grad(
+        chi_square(empty, torch.zeros(1, 2).double()).sum(),
+        empty,
+        create_graph=True,
+    )
     found = grad(first.sum(), empty)[0].tolist()
     assert found == [[0, 0]]
 
@@ -208,7 +276,10 @@ def test_gradients_are_finite_at_empty_cells_and_at_distance_zero(distance):
     distance(shapes, shapes).sum().backward()
     assert shapes.grad is not None
     assert torch.isfinite(shapes.grad).all()
-    assert torch.equal(shapes.grad[:, empty], torch.zeros(6, int(empty.sum()), dtype=torch.float64))
+    assert torch.equal(
+        shapes.grad[:, empty],
+        torch.zeros(6, int(empty.sum()), dtype=torch.float64),
+    )
 
 
 def test_chi_square_never_holds_all_triples_of_query_gallery_and_cell():
@@ -262,11 +333,17 @@ def test_wrong_descriptors_are_refused(queries, gallery, message):
 
 def test_chi_square_refuses_negative_entries():
     with pytest.raises(ValueError, match="gallery: expected entries ≥ 0"):
-        chi_square(torch.ones(2, 3), torch.tensor([[0.5, -0.1, 0.6]]))
+        chi_square(
+            torch.ones(2, 3),
+            torch.tensor([[0.5, -0.1, 0.6]]),
+        )
 
 
 def test_cosine_refuses_a_descriptor_without_direction():
     with pytest.raises(
         ValueError, match="queries: expected descriptors of non-zero length, 1 of 2"
     ):
-        cosine(torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.ones(1, 2))
+        cosine(
+            torch.tensor([[0.0, 0.0], [1.0, 0.0]]),
+            torch.ones(1, 2),
+        )

@@ -8,7 +8,12 @@ from igps.retrieval import chi_square, cosine, euclidean, rank, search
 
 
 def test_rank_orders_by_distance_and_ties_by_index():
-    distances = torch.tensor([[3.0, 1.0, 2.0, 1.0], [0.0, 0.0, float("inf"), 0.0]])
+    distances = torch.tensor(
+        [
+            [3.0, 1.0, 2.0, 1.0],
+            [0.0, 0.0, float("inf"), 0.0],
+        ]
+    )
     expected = [[1, 3, 2, 0], [0, 1, 3, 2]]
     assert rank(distances).tolist() == expected
 
@@ -22,7 +27,12 @@ def test_many_ties_keep_the_order_of_the_gallery():
 
 def test_search_returns_the_closest_with_their_distances():
     gallery = torch.tensor([[10.0], [4.0], [7.0], [1.0]])
-    result = search(torch.tensor([[5.0], [11.0]]), gallery, top=3, distance=euclidean)
+    result = search(
+        torch.tensor([[5.0], [11.0]]),
+        gallery,
+        top=3,
+        distance=euclidean,
+    )
     # 4 and 7 are 1 and 2 from 5, 1 is 4 from it
     expected = [[1, 2, 3], [0, 2, 1]]
     assert result.indices.tolist() == expected
@@ -31,12 +41,23 @@ def test_search_returns_the_closest_with_their_distances():
 
 
 def test_search_finds_each_shape_first_in_its_own_gallery_by_chi_square():
-    shapes = torch.rand(12, 3, 4, generator=torch.Generator().manual_seed(0))
+    shapes = torch.rand(
+        12,
+        3,
+        4,
+        generator=torch.Generator().manual_seed(0),
+    )
     result = search(shapes, shapes, top=12)
     found = result.indices[:, 0].tolist()
     assert found == list(range(12))
-    assert torch.equal(result.distances[:, 0], torch.zeros(12))
-    assert torch.equal(result.distances, chi_square(shapes, shapes).sort(1).values)
+    assert torch.equal(
+        result.distances[:, 0],
+        torch.zeros(12),
+    )
+    assert torch.equal(
+        result.distances,
+        chi_square(shapes, shapes).sort(1).values,
+    )
 
 
 def test_search_uses_the_distance_it_is_given():
@@ -53,7 +74,11 @@ def test_search_refuses_more_than_the_gallery_holds(top):
     with pytest.raises(
         ValueError, match=f"top: expected 1 to 3, the size of the gallery, got {top}"
     ):
-        search(torch.ones(1, 2), torch.ones(3, 2), top=top)
+        search(
+            torch.ones(1, 2),
+            torch.ones(3, 2),
+            top=top,
+        )
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,12 @@ LOG3 = math.log2(3)
 def random_case(*, n, n_classes, seed, ties=False):
     """Random distances (n, n), not symmetric, with every class of a size of its own."""
     generator = torch.Generator().manual_seed(seed)
-    distances = torch.rand(n, n, generator=generator, dtype=torch.float64)
+    distances = torch.rand(
+        n,
+        n,
+        generator=generator,
+        dtype=torch.float64,
+    )
     if ties:
         distances = (distances * 5).floor()
     labels = torch.randint(n_classes, (n,), generator=generator)
@@ -78,7 +83,10 @@ def line_distances(order, n):
 def test_hand_worked_leave_one_out_ranking():
     # Query 0 of class a = {0, 1, 2, 3} among six others ranks: 1 (hit), 4, 2 (hit), 5, 6, 3 (hit), so R = 3.
     labels = ["a", "a", "a", "a", "b", "b", "b"]
-    scores = retrieval_scores(line_distances([1, 4, 2, 5, 6, 3], 7), labels)
+    scores = retrieval_scores(
+        line_distances([1, 4, 2, 5, 6, 3], 7),
+        labels,
+    )
     expected = {
         "nn": 1.0,
         "ft": 2 / 3,
@@ -99,7 +107,10 @@ def test_distances_may_be_an_array_as_a_file_gives_them():
     expected = retrieval_scores(distances, labels).mean()
     assert retrieval_scores(distances.numpy(), labels).mean() == expected
     curve = precision_recall_curve(distances, labels).precision
-    assert torch.equal(precision_recall_curve(distances.numpy(), labels).precision, curve)
+    assert torch.equal(
+        precision_recall_curve(distances.numpy(), labels).precision,
+        curve,
+    )
 
 
 def test_another_default_device_changes_no_score():
@@ -111,13 +122,20 @@ def test_another_default_device_changes_no_score():
         found = retrieval_scores(distances, labels)
         assert found.mean() == expected.mean()
         assert found.per_class() == expected.per_class()
-        assert torch.equal(precision_recall_curve(distances, labels).precision, curve.precision)
+        assert torch.equal(
+            precision_recall_curve(distances, labels).precision,
+            curve.precision,
+        )
 
 
 def test_hand_worked_separate_gallery():
     # One query of class 1 against 0, 1, 1, 0, 1 ranked as 0 (miss), 2 (hit), 1 (hit), 3, 4 (hit).
     distances = torch.tensor([[0.1, 0.3, 0.2, 0.4, 0.5]])
-    scores = retrieval_scores(distances, [1], [0, 1, 1, 0, 1])
+    scores = retrieval_scores(
+        distances,
+        [1],
+        [0, 1, 1, 0, 1],
+    )
     assert scores.adr_self is None
     assert scores.mean() == pytest.approx(
         {
@@ -134,7 +152,10 @@ def test_hand_worked_separate_gallery():
 
 
 @pytest.mark.parametrize("ties", [False, True])
-@pytest.mark.parametrize(("n", "n_classes"), [(12, 3), (90, 2)])
+@pytest.mark.parametrize(
+    ("n", "n_classes"),
+    [(12, 3), (90, 2)],
+)
 def test_agrees_with_loops_over_ranks(n, n_classes, ties):
     distances, labels = random_case(n=n, n_classes=n_classes, seed=n, ties=ties)
     scores = retrieval_scores(distances, labels)
@@ -163,7 +184,10 @@ def test_perfect_retrieval_scores_one_and_the_worst_misses_all_tiers():
     perfect = retrieval_scores(1 - same, labels).mean()
     expected = pytest.approx(2 * 32 / (32 + 39))
     assert perfect.pop("e") == expected
-    assert perfect == pytest.approx(dict.fromkeys(perfect, 1.0), abs=1e-12)
+    assert perfect == pytest.approx(
+        dict.fromkeys(perfect, 1.0),
+        abs=1e-12,
+    )
     worst = retrieval_scores(same, labels).mean()
     found = [worst[name] for name in ("nn", "ft", "st", "e", "adr")]
     assert found == [0.0] * 5
@@ -298,7 +322,11 @@ def test_a_recall_level_that_is_a_number_of_hits_is_not_rounded_up():
     # 55 of 100 hits lead, then a miss: the precision at a recall of 0.55 is 1, above it 100/101.
     labels = [1] * 55 + [0] + [1] * 45
     assert 11 / 20 * 100 > 55  # in binary
-    curve = precision_recall_curve(torch.arange(101.0)[None], [1], labels)
+    curve = precision_recall_curve(
+        torch.arange(101.0)[None],
+        [1],
+        labels,
+    )
     expected = [1.0] * 11 + [100 / 101] * 9
     assert curve.precision.tolist() == expected
 
@@ -309,7 +337,10 @@ def test_metric_over_batches_is_the_function_over_all():
     labels = torch.randint(3, (30,), generator=generator)
     metric = RetrievalScoresMetric(euclidean)
     for start in range(0, 30, 7):
-        metric.update(descriptors[start : start + 7].requires_grad_(), labels[start : start + 7])
+        metric.update(
+            descriptors[start : start + 7].requires_grad_(),
+            labels[start : start + 7],
+        )
     result = metric.compute()
     expected = retrieval_scores(euclidean(descriptors, descriptors).detach(), labels).mean()
     found = {name: value.item() for name, value in result.items()}
@@ -364,7 +395,11 @@ def seven_shapes():
 
 
 def test_metric_counts_a_shape_once_over_processes(tmp_path):
-    torch.multiprocessing.spawn(_score_part, (str(tmp_path),), nprocs=2)
+    torch.multiprocessing.spawn(
+        _score_part,
+        (str(tmp_path),),
+        nprocs=2,
+    )
     descriptors, labels = seven_shapes()
     expected = retrieval_scores(euclidean(descriptors, descriptors), labels).mean()
     for process in range(2):
@@ -380,7 +415,11 @@ def test_metric_drops_repetitions_of_one_process():
     once.update(descriptors, labels)
     ids = [str(i) for i in range(7)]
     twice.update(descriptors, labels, ids)
-    twice.update(descriptors[3:], labels[3:], ids[3:])
+    twice.update(
+        descriptors[3:],
+        labels[3:],
+        ids[3:],
+    )
     assert twice.compute() == once.compute()
     twice.reset()
     twice.update(descriptors, labels)
@@ -390,14 +429,32 @@ def test_metric_drops_repetitions_of_one_process():
 def test_metric_refuses_names_that_are_not_aligned():
     metric = RetrievalScoresMetric()
     with pytest.raises(ValueError, match="ids: expected one name for each of 2"):
-        metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a"])
-    metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a", "b"])
+        metric.update(
+            torch.ones(2, 2),
+            torch.tensor([0, 0]),
+            ["a"],
+        )
+    metric.update(
+        torch.ones(2, 2),
+        torch.tensor([0, 0]),
+        ["a", "b"],
+    )
     with pytest.raises(ValueError, match="ids: expected in every update or in none"):
-        metric.update(torch.ones(2, 2), torch.tensor([0, 0]))
+        metric.update(
+            torch.ones(2, 2),
+            torch.tensor([0, 0]),
+        )
     metric.reset()
-    metric.update(torch.ones(2, 2), torch.tensor([0, 0]))
+    metric.update(
+        torch.ones(2, 2),
+        torch.tensor([0, 0]),
+    )
     with pytest.raises(ValueError, match="ids: expected in every update or in none"):
-        metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a", "b"])
+        metric.update(
+            torch.ones(2, 2),
+            torch.tensor([0, 0]),
+            ["a", "b"],
+        )
 
 
 def test_queries_with_one_answer_each_are_scored_by_its_rank():

@@ -56,7 +56,11 @@ def test_the_faces_at_each_vertex_form_one_fan(all_shapes):
 
 def test_one_component_of_the_recorded_genus(all_shapes):
     for shape in all_shapes:
-        surface = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+        surface = trimesh.Trimesh(
+            shape.vertices,
+            shape.faces,
+            process=False,
+        )
         assert surface.body_count == 1, shape.name
         assert surface.euler_number == 2 - 2 * shape.genus, shape.name
 
@@ -74,7 +78,11 @@ def test_arrays_and_triangles_are_sane(all_shapes):
         found = len(np.unique(shape.vertices, axis=0))
         assert found == len(shape.vertices)
         assert 1800 <= len(shape.vertices) <= 4200, shape.name
-        surface = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+        surface = trimesh.Trimesh(
+            shape.vertices,
+            shape.faces,
+            process=False,
+        )
         assert surface.volume > 0.05, shape.name
         angles = surface.face_angles
         assert np.degrees(angles.min()) > 5.0, shape.name
@@ -104,7 +112,11 @@ def test_shapes_of_a_class_differ(default_shapes):
     for start in range(0, 24, 3):
         compactness = []
         for shape in default_shapes[start : start + 3]:
-            surface = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+            surface = trimesh.Trimesh(
+                shape.vertices,
+                shape.faces,
+                process=False,
+            )
             compactness.append(surface.volume / surface.area**1.5)
         assert np.ptp(compactness) > 1e-3 * np.mean(compactness), default_shapes[start].name
 
@@ -117,7 +129,11 @@ def test_resolution_follows_n_vertices():
 
 def distance_histogram(shape):
     """D2 (Osada, Funkhouser, Chazelle and Dobkin 2002): distances of random surface points, over the area's root."""
-    mesh = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+    mesh = trimesh.Trimesh(
+        shape.vertices,
+        shape.faces,
+        process=False,
+    )
     points, _ = trimesh.sample.sample_surface(mesh, 800, seed=0)
     distances = np.linalg.norm(points[:400, None] - points[None, 400:], axis=2) / np.sqrt(mesh.area)
     return np.histogram(distances, 32, (0.0, 1.6))[0] / distances.size
@@ -183,7 +199,11 @@ def test_write_refuses_a_folder_of_other_shapes(tmp_path):
         ArticulatedShapes(n_classes=1, n_per_class=1, n_vertices=1000, seed=1).write(tmp_path)
 
 
-POINTS = np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3))
+POINTS = np.random.default_rng(0).uniform(
+    -1.5,
+    1.5,
+    (400, 3),
+)
 
 
 def nearest_sphere(centres, radii):
@@ -199,7 +219,13 @@ def swept(solid):
             line = np.column_stack([zero, zero, t * length])
             return nearest_sphere(line, start + t * (end - start))
         case Arc(bend, angle, start, end):
-            line = np.column_stack([zero, bend * (1 - np.cos(t * angle)), bend * np.sin(t * angle)])
+            line = np.column_stack(
+                [
+                    zero,
+                    bend * (1 - np.cos(t * angle)),
+                    bend * np.sin(t * angle),
+                ]
+            )
             return nearest_sphere(line, start + t * (end - start))
         case Ring(radius, tube, side):
             x = radius * np.cos(2 * np.pi * t)
@@ -207,12 +233,21 @@ def swept(solid):
             bows = np.column_stack([x, zero, z + np.sign(z) * side])
             right = np.column_stack([zero + radius, zero, (2 * t - 1) * side])
             left = right * [-1, 1, 1]
-            return nearest_sphere(np.concatenate([bows, right, left]), np.full(1, tube))
+            return nearest_sphere(
+                np.concatenate([bows, right, left]),
+                np.full(1, tube),
+            )
     raise AssertionError(solid)
 
 
 @pytest.mark.parametrize(
-    "solid", [Cone(0.9, 0.3, 0.1), Arc(0.6, 2.2, 0.15, 0.15), Ring(0.5, 0.2), Ring(0.4, 0.1, 0.3)]
+    "solid",
+    [
+        Cone(0.9, 0.3, 0.1),
+        Arc(0.6, 2.2, 0.15, 0.15),
+        Ring(0.5, 0.2),
+        Ring(0.4, 0.1, 0.3),
+    ],
 )
 def test_distance_to_swept_solids(solid):
     outside = swept(solid) > 0.0
@@ -221,10 +256,17 @@ def test_distance_to_swept_solids(solid):
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-@pytest.mark.parametrize("solid", [Box((1.0, 0.6, 1.6), 0.1), Prism(4, 0.9, 0.5, 0.05)])
+@pytest.mark.parametrize(
+    "solid",
+    [Box((1.0, 0.6, 1.6), 0.1), Prism(4, 0.9, 0.5, 0.05)],
+)
 def test_flat_solids_have_their_volume(solid):
     """Of a box and of a square prism, by counting points; the rounding takes off little."""
-    points = np.random.default_rng(1).uniform(-1.0, 1.0, (400_000, 3))
+    points = np.random.default_rng(1).uniform(
+        -1.0,
+        1.0,
+        (400_000, 3),
+    )
     volume = 8.0 * np.mean(solid.distance(*points.T) < 0.0)
     expected = 0.96 if isinstance(solid, Box) else 2.0 * 0.9**2 * 0.5
     assert 0.94 * expected < volume < 1.01 * expected

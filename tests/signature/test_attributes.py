@@ -52,7 +52,11 @@ def test_direction_on_the_surface_is_the_outward_normal(sphere):
 def test_potential_in_a_charged_ball_is_constant(sphere):
     points = np.random.default_rng(1).normal(size=(30, 3))
     points *= np.linspace(0, 0.9, 30)[:, None] / np.linalg.norm(points, axis=1)[:, None]
-    assert_allclose(electrostatic_potential(sphere, points), np.sqrt(4 * np.pi), rtol=2e-3)
+    assert_allclose(
+        electrostatic_potential(sphere, points),
+        np.sqrt(4 * np.pi),
+        rtol=2e-3,
+    )
 
 
 def test_potential_in_a_box_is_the_surface_integral(box):
@@ -74,7 +78,11 @@ def test_potential_in_a_box_is_the_surface_integral(box):
             )
             total += value
     finer = Mesh(*trimesh.remesh.subdivide(box.vertices, box.faces))
-    assert_allclose(electrostatic_potential(finer, point[None]), total / np.sqrt(22), rtol=1e-3)
+    assert_allclose(
+        electrostatic_potential(finer, point[None]),
+        total / np.sqrt(22),
+        rtol=1e-3,
+    )
 
 
 def test_potential_stays_finite_on_a_vertex(sphere):
@@ -85,7 +93,10 @@ def test_potential_stays_finite_on_a_vertex(sphere):
 
 def test_attributes_do_not_change_with_scale_or_place(box, points):
     names = ("depth", "electrostatic_potential", "surface_direction")
-    moved = Mesh(box.vertices * 7 + [100.0, 0, 5], box.faces)
+    moved = Mesh(
+        box.vertices * 7 + [100.0, 0, 5],
+        box.faces,
+    )
     here, there = (
         interior_attributes(m, p, names)
         for m, p in ((box, points), (moved, points * 7 + [100.0, 0, 5]))

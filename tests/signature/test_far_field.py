@@ -32,7 +32,11 @@ def commute_time_embedding(name):
         mesh = bumpy_sphere(4)
     else:
         mesh = with_slivers(*bumpy_sphere(4), 300)
-    spectrum = eigenpairs(*laplacian(geometry.Mesh(*mesh)), 100, positions=mesh[0])
+    spectrum = eigenpairs(
+        *laplacian(geometry.Mesh(*mesh)),
+        100,
+        positions=mesh[0],
+    )
     return mesh, spectrum.eigenfunctions / np.sqrt(spectrum.eigenvalues)
 
 
@@ -54,7 +58,10 @@ def test_approximation_tends_to_the_exact_result():
     points = interior_points(mesh, 60)
     functions = smooth_functions(mesh[0])
     exact = extend(*mesh, functions, points)
-    assert np.array_equal(extend(*mesh, functions, points, accuracy=1e-9), exact)  # nothing is far
+    assert np.array_equal(
+        extend(*mesh, functions, points, accuracy=1e-9),
+        exact,
+    )  # nothing is far
     errors = []
     for accuracy in (1e-3, 1e-4, 1e-5, 1e-9):
         found = extend(*mesh, functions, points, accuracy=accuracy)
@@ -72,7 +79,14 @@ def test_surface_points_are_interpolated_also_where_most_of_the_surface_is_far()
     barycentric = rng.dirichlet(np.ones(3), size=60)
     points = np.einsum("pi,pix->px", barycentric, vertices[faces[chosen]])
     expected = np.einsum("pi,pik->pk", barycentric, functions[faces[chosen]])
-    result = extend(vertices, faces, functions, points, accuracy=1e-2, dtype=np.float64)
+    result = extend(
+        vertices,
+        faces,
+        functions,
+        points,
+        accuracy=1e-2,
+        dtype=np.float64,
+    )
     assert_allclose(result, expected, atol=1e-12)
 
 
@@ -97,7 +111,10 @@ def test_approximation_reproduces_positions():
     mesh = torus(240, 80)
     points = interior_points(mesh, 300)
     for accuracy in (1e-2, 1e-3, 1e-4):
-        error = np.linalg.norm(extend(*mesh, mesh[0], points, accuracy=accuracy) - points, axis=1)
+        error = np.linalg.norm(
+            extend(*mesh, mesh[0], points, accuracy=accuracy) - points,
+            axis=1,
+        )
         assert 1e-9 < np.quantile(error, 0.99) < accuracy
 
 
@@ -128,7 +145,12 @@ def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(monkeypatch
 
     def error(accuracy):
         found = extend(*mesh, functions, points, accuracy=accuracy)
-        return float(np.quantile(np.abs(pdist(found) / pdist(exact) - 1), 0.99))
+        return float(
+            np.quantile(
+                np.abs(pdist(found) / pdist(exact) - 1),
+                0.99,
+            )
+        )
 
     accuracy = 1e-4
     assert error(accuracy) < accuracy
@@ -150,7 +172,13 @@ def test_where_no_approximation_serves_the_closed_form_does(monkeypatch):
         return 1.0
 
     monkeypatch.setattr(Extension, "_sampled_error", never)
-    found = extend(*mesh, functions, points, accuracy=1e-3, dtype=np.float64)
+    found = extend(
+        *mesh,
+        functions,
+        points,
+        accuracy=1e-3,
+        dtype=np.float64,
+    )
     expected = extend(*mesh, functions, points)
     assert_allclose(found, expected, atol=1e-12)
     assert settings

@@ -31,16 +31,30 @@ def test_stiffness_equals_lapy_and_libigl(blob):
     stiffness, _ = laplacian(blob)
     lapy = Solver(TriaMesh(np.array(blob.vertices), np.array(blob.faces))).stiffness
     assert abs(stiffness - lapy).max() < 1e-5  # LaPy assembles in single precision in places
-    libigl = -igl.cotmatrix(np.array(blob.vertices), np.array(blob.faces))
+    libigl = -igl.cotmatrix(
+        np.array(blob.vertices),
+        np.array(blob.faces),
+    )
     assert abs(stiffness - libigl).max() < 1e-12
 
 
 def test_mixed_voronoi_mass_equals_libigl(blob):
     """Also of a tetrahedron with obtuse faces."""
-    corners = np.array([[0, 0, 0], [2, 0, 0], [3, 1, 0], [1.7, 0.4, 0.6]])
+    corners = np.array(
+        [
+            [0, 0, 0],
+            [2, 0, 0],
+            [3, 1, 0],
+            [1.7, 0.4, 0.6],
+        ]
+    )
     for mesh in (blob, Mesh(corners, FACES)):
         vertices = np.array(mesh.vertices)
-        libigl = igl.massmatrix(vertices, np.array(mesh.faces), igl.MASSMATRIX_TYPE_VORONOI)
+        libigl = igl.massmatrix(
+            vertices,
+            np.array(mesh.faces),
+            igl.MASSMATRIX_TYPE_VORONOI,
+        )
         found = laplacian(mesh)[1]
         np.testing.assert_allclose(found, libigl.diagonal(), rtol=1e-10)
 

@@ -71,16 +71,29 @@ def test_weights_sum_to_one_and_reproduce_linear_functions(mesh, sample):
     assert_allclose(weights @ mesh[0], points, atol=1e-9)
 
 
-@pytest.mark.parametrize("mesh", [bumpy_sphere(1), cube()], ids=["bumpy", "cube"])
+@pytest.mark.parametrize(
+    "mesh",
+    [bumpy_sphere(1), cube()],
+    ids=["bumpy", "cube"],
+)
 def test_weights_equal_the_published_loop(mesh):
-    points = np.concatenate([interior_points(mesh, 15), exterior_points(mesh, 15)])
+    points = np.concatenate(
+        [
+            interior_points(mesh, 15),
+            exterior_points(mesh, 15),
+        ]
+    )
     expected = np.stack([published_loop(*mesh, point) for point in points])
     assert_allclose(mean_value_coordinates(*mesh, points), expected, atol=1e-9)
 
 
 def test_centre_of_a_regular_solid_weighs_all_vertices_alike():
     icosahedron = trimesh.creation.icosahedron()
-    weights = mean_value_coordinates(icosahedron.vertices, icosahedron.faces, np.zeros((1, 3)))
+    weights = mean_value_coordinates(
+        icosahedron.vertices,
+        icosahedron.faces,
+        np.zeros((1, 3)),
+    )
     assert_allclose(weights, 1 / 12, atol=1e-14)
 
 
@@ -125,7 +138,14 @@ def test_points_in_the_planes_of_faces_are_exact(subdivisions, offset):
     box = trimesh.creation.box(extents=(2, 2, 2))
     for _ in range(subdivisions):
         box = box.subdivide()
-    line = [-2.0, -1.0 + offset, -0.51, 0.0, 1.0 + offset, 1.53]
+    line = [
+        -2.0,
+        -1.0 + offset,
+        -0.51,
+        0.0,
+        1.0 + offset,
+        1.53,
+    ]
     grid = np.stack(np.meshgrid(line, line, line), -1).reshape(-1, 3)
     turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix().T
     vertices = box.vertices @ turn
@@ -141,11 +161,25 @@ def test_similarities_do_not_change_the_result(accuracy):
     vertices, faces = bumpy_sphere(3)
     points = interior_points((vertices, faces), 40)
     functions = smooth_functions(vertices)
-    expected = extend(vertices, faces, functions, points, accuracy=accuracy, dtype=np.float64)
+    expected = extend(
+        vertices,
+        faces,
+        functions,
+        points,
+        accuracy=accuracy,
+        dtype=np.float64,
+    )
     rotation = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
     for scale, shift, tolerance in ((1e-6, 0.0, 1e-9), (1e6, 0.0, 1e-9), (1.0, 1e4, 1e-7)):
         moved, moved_points = (scale * array @ rotation.T + shift for array in (vertices, points))
-        result = extend(moved, faces, functions, moved_points, accuracy=accuracy, dtype=np.float64)
+        result = extend(
+            moved,
+            faces,
+            functions,
+            moved_points,
+            accuracy=accuracy,
+            dtype=np.float64,
+        )
         assert_allclose(result, expected, atol=tolerance)
 
 
@@ -167,22 +201,67 @@ def test_flat_faces_and_loose_vertices_contribute_nothing(accuracy):
     points = interior_points((vertices, faces), 30)
     functions = smooth_functions(vertices)
     expected = extend(vertices, faces, functions, points, accuracy=accuracy)
-    more = np.concatenate([vertices, [vertices[5], points[0], points[1] / 4]])
+    more = np.concatenate(
+        [
+            vertices,
+            [vertices[5], points[0], points[1] / 4],
+        ]
+    )
     n = len(vertices)
-    flat = np.array([[0, 0, 1], [5, n, 7], [3, 3, 3], [n + 1, n + 1, 2]])
-    values = np.concatenate([functions, np.full((3, functions.shape[1]), 100.0)])
-    result = extend(more, np.concatenate([faces, flat]), values, points, accuracy=accuracy)
+    flat = np.array(
+        [
+            [0, 0, 1],
+            [5, n, 7],
+            [3, 3, 3],
+            [n + 1, n + 1, 2],
+        ]
+    )
+    values = np.concatenate(
+        [
+            functions,
+            np.full((3, functions.shape[1]), 100.0),
+        ]
+    )
+    result = extend(
+        more,
+        np.concatenate([faces, flat]),
+        values,
+        points,
+        accuracy=accuracy,
+    )
     assert_allclose(result, expected, atol=1e-12 if accuracy is None else 1e-5)
 
 
-@pytest.mark.parametrize(("accuracy", "tolerance"), [(None, 1e-12), (7e-3, 1e-11)])
+@pytest.mark.parametrize(
+    ("accuracy", "tolerance"),
+    [(None, 1e-12), (7e-3, 1e-11)],
+)
 def test_pieces_do_not_change_the_result(accuracy, tolerance, monkeypatch):
     vertices, faces = bumpy_sphere(3)
-    points = np.concatenate([interior_points((vertices, faces), 43), vertices[:3]])
+    points = np.concatenate(
+        [
+            interior_points((vertices, faces), 43),
+            vertices[:3],
+        ]
+    )
     functions = smooth_functions(vertices)
-    whole = extend(vertices, faces, functions, points, accuracy=accuracy, dtype=np.float64)
+    whole = extend(
+        vertices,
+        faces,
+        functions,
+        points,
+        accuracy=accuracy,
+        dtype=np.float64,
+    )
     monkeypatch.setattr(coordinates, "_BLOCK_BYTES", 3 * 8 * len(vertices))
-    limited = extend(vertices, faces, functions, points, accuracy=accuracy, dtype=np.float64)
+    limited = extend(
+        vertices,
+        faces,
+        functions,
+        points,
+        accuracy=accuracy,
+        dtype=np.float64,
+    )
     assert_allclose(limited, whole, atol=tolerance)
 
 
@@ -200,12 +279,24 @@ def test_single_precision_agrees_with_double(accuracy):
 
 
 @pytest.mark.parametrize(
-    ("accuracy", "dtype"), [(1e-3, np.float32), (1e-5, np.float64), (None, np.float64)]
+    ("accuracy", "dtype"),
+    [
+        (1e-3, np.float32),
+        (1e-5, np.float64),
+        (None, np.float64),
+    ],
 )
 def test_the_cheapest_precision_that_keeps_the_accuracy_is_taken(accuracy, dtype):
     mesh = bumpy_sphere(3)
     arguments = *mesh, smooth_functions(mesh[0]), interior_points(mesh, 30)
-    chosen, given = (extend(*arguments, accuracy=accuracy, dtype=d) for d in (None, dtype))
+    chosen, given = (
+        extend(
+            *arguments,
+            accuracy=accuracy,
+            dtype=d,
+        )
+        for d in (None, dtype)
+    )
     assert np.array_equal(chosen, given)
 
 
@@ -275,13 +366,21 @@ def test_functions_are_divided_on_the_way(accuracy):
     points = generator.uniform(-0.4, 0.4, (30, 3))
     divisors = np.array([0.5, 1.0, 3.0, 7.0])
     result = extend(*mesh, functions, points, divisors=divisors, accuracy=accuracy)
-    assert np.array_equal(result, extend(*mesh, functions / divisors, points, accuracy=accuracy))
+    assert np.array_equal(
+        result,
+        extend(*mesh, functions / divisors, points, accuracy=accuracy),
+    )
 
 
 def test_finite_functions_may_sum_to_infinity():
     vertices, faces = cube()
     huge = np.full((8, 2), 3e38, dtype=np.float32)
-    found = extend(vertices, faces, huge, np.zeros((1, 3)))
+    found = extend(
+        vertices,
+        faces,
+        huge,
+        np.zeros((1, 3)),
+    )
     expected = pytest.approx(3e38, rel=1e-6)
     assert found == expected
 
@@ -290,4 +389,9 @@ def test_weights_without_a_sum_raise():
     """A point in the plane of a single triangle sees nothing of it."""
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     with pytest.raises(ValueError, match="points: expected mean value weights with a non-zero sum"):
-        extend(vertices, np.array([[0, 1, 2]]), np.ones((3, 1)), np.array([[2.0, 2, 0]]))
+        extend(
+            vertices,
+            np.array([[0, 1, 2]]),
+            np.ones((3, 1)),
+            np.array([[2.0, 2, 0]]),
+        )

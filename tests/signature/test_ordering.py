@@ -36,7 +36,10 @@ def renumbered(mesh, seed=5):
     faces = np.argsort(order)[mesh.faces][generator.permutation(len(mesh.faces))]
     shifts = generator.integers(0, 3, len(faces))
     corners = (np.arange(3) - shifts[:, None]) % 3
-    return Mesh(mesh.vertices[order], np.take_along_axis(faces, corners, axis=1))
+    return Mesh(
+        mesh.vertices[order],
+        np.take_along_axis(faces, corners, axis=1),
+    )
 
 
 def spectrum_of(n_points):
@@ -71,7 +74,11 @@ def test_points_of_one_potential_have_different_places():
     both = np.concatenate([functions, functions * mirror])
     found = ordering_keys(both, eigenvalues, 1.0)
     assert np.diff(np.sort(found)).min() > 1e-9
-    exchanged = ordering_keys(np.concatenate([functions * mirror, functions]), eigenvalues, 1.0)
+    exchanged = ordering_keys(
+        np.concatenate([functions * mirror, functions]),
+        eigenvalues,
+        1.0,
+    )
     expected = np.sort(found)
     assert_allclose(np.sort(exchanged), expected, rtol=1e-9)
 
@@ -82,7 +89,10 @@ def test_spacings_and_area_shares_by_hand():
     expected = np.abs(line[:, 0] - line[:, :1]).mean(axis=1)  # all are nearest
     assert_allclose(nearest_spacing(line), expected / expected.mean())
     areas = np.array([1.0, 2.0, 4.0])
-    shares = vertex_area_shares(np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]), areas)
+    shares = vertex_area_shares(
+        np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]),
+        areas,
+    )
     assert_allclose(shares * 21 / 4, [3, 5, 7, 6])
 
 
@@ -119,11 +129,17 @@ def bodies():
 
 
 MOVES = {
-    "axes": lambda mesh: Mesh(mesh.vertices[:, [1, 2, 0]], mesh.faces),
+    "axes": lambda mesh: Mesh(
+        mesh.vertices[:, [1, 2, 0]],
+        mesh.faces,
+    ),
     "quarter turn": lambda mesh: Mesh(
         mesh.vertices @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), mesh.faces
     ),
-    "mirror image": lambda mesh: Mesh(mesh.vertices * [1, -1, 1], mesh.faces[:, ::-1]),
+    "mirror image": lambda mesh: Mesh(
+        mesh.vertices * [1, -1, 1],
+        mesh.faces[:, ::-1],
+    ),
     "numbering": renumbered,
 }
 
@@ -148,7 +164,14 @@ def test_histograms_of_subsets_do_not_move(move, histograms, still):
         assert batch.interior.mask.sum() > 300  # the subsets are some
     moved = {}
     for name, mesh in bodies().items():
-        moved[name] = collate([compute_signature(MOVES[move](mesh), CONFIG)])
+        moved[name] = collate(
+            [
+                compute_signature(
+                    MOVES[move](mesh),
+                    CONFIG,
+                )
+            ]
+        )
     for histogram in histograms:
         before = torch.cat([histogram(batch) for batch in still.values()])
         after = torch.cat([histogram(batch) for batch in moved.values()])
@@ -215,8 +238,15 @@ def test_the_order_of_form_keeps_the_surface(blob):
 
 def test_the_order_of_form_does_not_depend_on_place_and_scale(blob):
     turn = Rotation.from_rotvec([0.3, 1.1, -0.7]).as_matrix()
-    moved = replace(blob, vertices=2.5 * blob.vertices @ turn.T + [3, -1, 2])
+    moved = replace(
+        blob,
+        vertices=2.5 * blob.vertices @ turn.T + [3, -1, 2],
+    )
     expected = in_canonical_order(blob)
     found = in_canonical_order(moved)
     assert_array_equal(found.faces, expected.faces)
-    assert_allclose(found.vertices, 2.5 * expected.vertices @ turn.T + [3, -1, 2], atol=1e-12)
+    assert_allclose(
+        found.vertices,
+        2.5 * expected.vertices @ turn.T + [3, -1, 2],
+        atol=1e-12,
+    )

@@ -18,7 +18,11 @@ def ball(*semi_axes):
 
 
 def rod(length, radius):
-    capsule = trimesh.creation.capsule(height=length, radius=radius, count=[48, 48])
+    capsule = trimesh.creation.capsule(
+        height=length,
+        radius=radius,
+        count=[48, 48],
+    )
     return Mesh(capsule.vertices, capsule.faces)
 
 
@@ -51,7 +55,11 @@ def of_ball(r):
 
 def of_ellipsoid(a, b, c):
     """The area and the integral of the mean curvature by sums over a fine grid of the parameters."""
-    u, v = np.meshgrid(np.linspace(0, np.pi, 2001), np.linspace(0, 2 * np.pi, 2001), indexing="ij")
+    u, v = np.meshgrid(
+        np.linspace(0, np.pi, 2001),
+        np.linspace(0, 2 * np.pi, 2001),
+        indexing="ij",
+    )
     x = np.sin(u) * np.cos(v)
     y = np.sin(u) * np.sin(v)
     z = np.cos(u)
@@ -119,7 +127,10 @@ CLOSED_FORMS = {
 @pytest.mark.parametrize("name", CLOSED_FORMS)
 def test_measures_are_those_of_closed_forms_in_any_position(name):
     mesh, expected = CLOSED_FORMS[name]
-    moved = Mesh(mesh.vertices @ ROTATION.T + [5, -3, 2], mesh.faces)
+    moved = Mesh(
+        mesh.vertices @ ROTATION.T + [5, -3, 2],
+        mesh.faces,
+    )
     found = measures(moved)
     for measure in expected.keys() - {"hull"}:
         assert found[measure] == pytest.approx(expected[measure], rel=0.01), measure
@@ -142,7 +153,10 @@ def test_thickness_of_a_box_falls_towards_its_edges_as_its_closed_form():
     high = np.full(len(depths), sides.min() / 2)
     for _ in range(30):
         r = (low + high) / 2
-        to_centres = np.linalg.norm(np.maximum(r[:, None] - depths, 0), axis=1)
+        to_centres = np.linalg.norm(
+            np.maximum(r[:, None] - depths, 0),
+            axis=1,
+        )
         low = np.where(to_centres <= r, r, low)
         high = np.where(to_centres <= r, high, r)
     expected = pytest.approx(2 * low.mean(), rel=0.015)
@@ -151,5 +165,8 @@ def test_thickness_of_a_box_falls_towards_its_edges_as_its_closed_form():
 
 
 def test_the_thickness_at_a_single_point_is_that_of_its_ball():
-    found = local_thickness(ball(1.5, 1.5, 1.5), np.zeros((1, 3)))
+    found = local_thickness(
+        ball(1.5, 1.5, 1.5),
+        np.zeros((1, 3)),
+    )
     assert found == pytest.approx([3.0], rel=0.01)

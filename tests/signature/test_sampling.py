@@ -12,7 +12,10 @@ from igps.signature.sampling import surface_points
 
 def test_faces_are_drawn_by_their_area():
     mesh = Mesh(TETRAHEDRON * [1, 2, 5], FACES)
-    counts = np.bincount(surface_points(mesh, 20_000, seed=0).face, minlength=4)
+    counts = np.bincount(
+        surface_points(mesh, 20_000, seed=0).face,
+        minlength=4,
+    )
     area = face_areas(mesh.vertices, mesh.faces)
     assert chisquare(counts, 20_000 * area / area.sum()).pvalue > 0.01
     assert chisquare(counts, np.full(4, 5000)).pvalue < 1e-9
@@ -34,8 +37,15 @@ def test_linear_functions_are_interpolated_exactly(blob):
         points.interpolate(blob.vertices @ slopes), points.positions @ slopes, atol=1e-12
     )
     corners = blob.vertices[blob.faces[points.face]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert_allclose(np.einsum("ij,ij->i", points.positions - corners[:, 0], normals), 0, atol=1e-12)
+    normals = np.cross(
+        corners[:, 1] - corners[:, 0],
+        corners[:, 2] - corners[:, 0],
+    )
+    assert_allclose(
+        np.einsum("ij,ij->i", points.positions - corners[:, 0], normals),
+        0,
+        atol=1e-12,
+    )
 
 
 def test_the_seed_alone_decides(blob):

@@ -65,7 +65,12 @@ def test_distance_and_potential_equal_the_papers_gram_form(blob, signature):
     points = signature.interior.points[::9]
     weights = np.asarray(mean_value_coordinates(blob.vertices, blob.faces, points))
     difference = weights[:, None] - weights[None]
-    distance = np.sqrt(np.maximum(np.einsum("pqi,ij,pqj->pq", difference, gram, difference), 0))
+    distance = np.sqrt(
+        np.maximum(
+            np.einsum("pqi,ij,pqj->pq", difference, gram, difference),
+            0,
+        )
+    )
     potential = np.sqrt(np.einsum("pi,ij,pj->p", weights, gram, weights))
 
     eigenfunctions = torch.from_numpy(signature.interior.eigenfunctions[::9]).double()
@@ -95,8 +100,14 @@ def test_scale_does_not_matter(blob, signature, scale):
 
 
 def test_grid_symmetries_and_shifts_do_not_matter(blob, signature):
-    turn = np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], dtype=float)
-    moved = compute_signature(Mesh(blob.vertices @ turn.T + [10, -200, 3], blob.faces), CONFIG)
+    turn = np.array(
+        [[0, -1, 0], [0, 0, 1], [-1, 0, 0]],
+        dtype=float,
+    )
+    moved = compute_signature(
+        Mesh(blob.vertices @ turn.T + [10, -200, 3], blob.faces),
+        CONFIG,
+    )
     for samples in ("interior", "surface"):
         assert_allclose(histogram(moved, samples), histogram(signature, samples), atol=1e-5)
 
@@ -118,7 +129,11 @@ def test_surface_samples_lie_on_the_surface_and_follow_its_area():
         box = box.subdivide()
     config = SignatureConfig(n_eigenpairs=10, resolution=8, min_samples=0, n_surface_samples=20_000)
     points = compute_signature(as_mesh(box), config).surface.points
-    on_face = np.isclose(np.abs(points), [0.5, 1.0, 1.5], atol=1e-12)
+    on_face = np.isclose(
+        np.abs(points),
+        [0.5, 1.0, 1.5],
+        atol=1e-12,
+    )
     assert on_face.any(axis=1).all()
     share = on_face[on_face.sum(axis=1) == 1].mean(axis=0)
     expected = np.array([6, 3, 2]) / 11
@@ -129,9 +144,16 @@ def test_surface_values_are_interpolated_linearly(blob, signature):
     blob = blob.numbered_by_faces()  # on which the signs of eigenfunctions depend
     spectrum = eigenpairs(*laplacian(blob), 40, positions=blob.vertices)
     surface = trimesh.Trimesh(blob.vertices, blob.faces, process=False)
-    closest, _, face = trimesh.proximity.closest_point_naive(surface, signature.surface.points[:20])
+    closest, _, face = trimesh.proximity.closest_point_naive(
+        surface,
+        signature.surface.points[:20],
+    )
     weights = trimesh.triangles.points_to_barycentric(surface.triangles[face], closest)
-    expected = np.einsum("pi,pik->pk", weights, spectrum.eigenfunctions[surface.faces[face]])
+    expected = np.einsum(
+        "pi,pik->pk",
+        weights,
+        spectrum.eigenfunctions[surface.faces[face]],
+    )
     found = signature.surface.eigenfunctions[:20]
     assert_allclose(found, expected, atol=1e-4)
 

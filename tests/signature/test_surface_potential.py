@@ -25,7 +25,13 @@ def by_quadrature(triangle, point):
         distance = np.cross(along, normal) @ (p - foot)
         if abs(distance) < 1e-14:
             continue
-        angles = [np.arctan2((end - foot) @ along, abs(distance)) for end in (p, q)]
+        angles = [
+            np.arctan2(
+                (end - foot) @ along,
+                abs(distance),
+            )
+            for end in (p, q)
+        ]
         # ∫ r dr / √(r² + h²) from the foot to the side, for each direction.
         value, _ = scipy.integrate.quad(
             lambda t, d=distance: np.hypot(d / np.cos(t), height) - abs(height),
@@ -50,30 +56,62 @@ def triangle_of(kind):
 @pytest.mark.parametrize("height", [0.0, 1e-9, -0.3, 5.0])
 def test_triangle_equals_quadrature(kind, height):
     triangle = triangle_of(kind)
-    normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
+    normal = np.cross(
+        triangle[1] - triangle[0],
+        triangle[2] - triangle[0],
+    )
     normal /= norm(normal)
     weights = np.array(
-        [[0.2, 0.3, 0.5], [0.9, 0.05, 0.05], [1.4, -0.2, -0.2], [-0.6, 0.9, 0.7], [2.5, -3.0, 1.5]]
+        [
+            [0.2, 0.3, 0.5],
+            [0.9, 0.05, 0.05],
+            [1.4, -0.2, -0.2],
+            [-0.6, 0.9, 0.7],
+            [2.5, -3.0, 1.5],
+        ]
     )
     points = weights @ triangle + height * normal
     expected = [by_quadrature(triangle, point) for point in points]
-    result = surface_potential(triangle, np.array([[0, 1, 2]]), points)
+    result = surface_potential(
+        triangle,
+        np.array([[0, 1, 2]]),
+        points,
+    )
     assert_allclose(result, expected, rtol=1e-4)
-    exact = surface_potential(triangle, np.array([[0, 1, 2]]), points, accuracy=1e-12)
+    exact = surface_potential(
+        triangle,
+        np.array([[0, 1, 2]]),
+        points,
+        accuracy=1e-12,
+    )
     assert_allclose(exact, expected, rtol=1e-7)
 
 
 def test_square_from_its_centre_side_and_corner():
-    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    square = np.array(
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]],
+        dtype=float,
+    )
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     # On the diagonal, and at its ends or not
-    points = np.array([[0.5, 0.5, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]])
+    points = np.array(
+        [
+            [0.5, 0.5, 0],
+            [0, 0, 0],
+            [1, 1, 0],
+            [0, 1, 0],
+        ]
+    )
     expected = np.log(1 + np.sqrt(2)) * np.array([4, 2, 2, 2])
     found = surface_potential(square, faces, points)
     assert_allclose(found, expected, rtol=1e-12)
     # A side's middle sees two rectangles of 1 × ½.
     middle = 2 * (np.arcsinh(0.5) + 0.5 * np.arcsinh(2))
-    assert_allclose(surface_potential(square, faces, np.array([[0.5, 0, 0]])), middle, rtol=1e-12)
+    assert_allclose(
+        surface_potential(square, faces, np.array([[0.5, 0, 0]])),
+        middle,
+        rtol=1e-12,
+    )
 
 
 def test_disc_on_its_axis():
@@ -81,7 +119,13 @@ def test_disc_on_its_axis():
     angles = np.linspace(0, 2 * np.pi, n, endpoint=False)
     rim = 3 * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(n)])
     vertices = np.vstack([rim, np.zeros(3)])
-    faces = np.column_stack([np.arange(n), np.roll(np.arange(n), -1), np.full(n, n)])
+    faces = np.column_stack(
+        [
+            np.arange(n),
+            np.roll(np.arange(n), -1),
+            np.full(n, n),
+        ]
+    )
     heights = np.array([0, 1e-6, 0.01, 0.5, 3, -20, 300])
     points = np.column_stack([0 * heights, 0 * heights, heights])
     expected = 2 * np.pi * (np.sqrt(9 + heights**2) - np.abs(heights))
@@ -96,9 +140,18 @@ def test_centre_of_a_cylinder_of_needles(n_subdivisions):
         cylinder = cylinder.subdivide()
     side = 2 * np.pi * 0.2 * 2 * np.arcsinh(2 / 0.2)
     caps = 2 * 2 * np.pi * (np.hypot(0.2, 2) - 2)
-    result = surface_potential(cylinder.vertices, cylinder.faces, np.zeros((1, 3)))
+    result = surface_potential(
+        cylinder.vertices,
+        cylinder.faces,
+        np.zeros((1, 3)),
+    )
     assert_allclose(result, side + caps, rtol=1e-4)  # a polygon of 300 sides
-    exact = surface_potential(cylinder.vertices, cylinder.faces, np.zeros((1, 3)), accuracy=1e-12)
+    exact = surface_potential(
+        cylinder.vertices,
+        cylinder.faces,
+        np.zeros((1, 3)),
+        accuracy=1e-12,
+    )
     assert_allclose(result, exact, rtol=1e-5)
 
 
@@ -109,7 +162,12 @@ def body():
     ball.vertices += [0, 0, 1.8]
     vertices = np.vstack([cylinder.vertices, ball.vertices])
     vertices[:, 0] += 0.2 * vertices[:, 2] ** 2
-    return vertices, np.vstack([cylinder.faces, ball.faces + len(cylinder.vertices)])
+    return vertices, np.vstack(
+        [
+            cylinder.faces,
+            ball.faces + len(cylinder.vertices),
+        ]
+    )
 
 
 def samples(vertices, faces):
@@ -120,7 +178,11 @@ def samples(vertices, faces):
     on = np.einsum("pi,pij->pj", weights, corners)
     return np.vstack(
         [
-            generator.uniform(vertices.min(axis=0) - 0.5, vertices.max(axis=0) + 0.5, (200, 3)),
+            generator.uniform(
+                vertices.min(axis=0) - 0.5,
+                vertices.max(axis=0) + 0.5,
+                (200, 3),
+            ),
             generator.normal(size=(20, 3)) * 50,
             vertices[::101],
             (corners[:, 0] + corners[:, 1]) / 2,
@@ -152,7 +214,14 @@ def test_exact_values_are_the_sum_over_the_triangles():
         sum(by_quadrature(vertices[face], point) for face in faces[::37]) for point in points
     ]
     assert_allclose(
-        surface_potential(vertices, faces[::37], points, accuracy=1e-13), expected, rtol=1e-7
+        surface_potential(
+            vertices,
+            faces[::37],
+            points,
+            accuracy=1e-13,
+        ),
+        expected,
+        rtol=1e-7,
     )
     assert (exact > expected).all()
 

@@ -17,7 +17,10 @@ def grid_points(axes):
 
 
 def test_box_is_filled_exactly():
-    points = interior_samples(as_mesh(box((1, 2, 4))), resolution=32)
+    points = interior_samples(
+        as_mesh(box((1, 2, 4))),
+        resolution=32,
+    )
     assert len(points) == 8 * 16 * 32
     found = np.sort(np.unique(points[:, 0].round(9)))
     expected = (np.arange(8) - 3.5) / 8
@@ -38,12 +41,20 @@ def test_radial_law_of_a_ball(sphere):
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: trimesh.creation.torus(1, 0.3), lambda: trimesh.creation.capsule(2, 0.5)]
+    "make",
+    [
+        lambda: trimesh.creation.torus(1, 0.3),
+        lambda: trimesh.creation.capsule(2, 0.5),
+    ],
 )
 def test_inside_equals_libigl_winding_number(make):
     mesh = as_mesh(make())
     axes = grid_axes(mesh, 19)
-    winding = igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces), grid_points(axes))
+    winding = igl.winding_number(
+        np.array(mesh.vertices),
+        np.array(mesh.faces),
+        grid_points(axes),
+    )
     found = inside_grid(mesh, axes).ravel()
     assert_array_equal(found, winding > 0.5)
 
@@ -59,10 +70,27 @@ def test_grid_lines_through_vertices_and_edges():
 
 def _octahedron():
     vertices = np.array(
-        [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float
+        [
+            [1, 0, 0],
+            [-1, 0, 0],
+            [0, 1, 0],
+            [0, -1, 0],
+            [0, 0, 1],
+            [0, 0, -1],
+        ],
+        dtype=float,
     )
     faces = np.array(
-        [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+        [
+            [0, 2, 4],
+            [2, 1, 4],
+            [1, 3, 4],
+            [3, 0, 4],
+            [2, 0, 5],
+            [1, 2, 5],
+            [3, 1, 5],
+            [0, 3, 5],
+        ]
     )
     return vertices, faces
 
@@ -73,7 +101,11 @@ def test_overlapping_parts_count_as_inside_once_or_twice():
     surface.vertices[:, 0] *= 0.5  # the tube now crosses itself near the axis
     mesh = as_mesh(surface)
     axes = grid_axes(mesh, 24)
-    winding = igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces), grid_points(axes))
+    winding = igl.winding_number(
+        np.array(mesh.vertices),
+        np.array(mesh.faces),
+        grid_points(axes),
+    )
     found = inside_grid(mesh, axes).ravel()
     assert_array_equal(found, winding > 0.5)
 
@@ -81,13 +113,25 @@ def test_overlapping_parts_count_as_inside_once_or_twice():
 def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(sphere):
     axes = grid_axes(sphere, 24)
     whole = inside_grid(sphere, axes)
-    few = np.delete(sphere.faces, [3, 700, 2222], axis=0)
+    few = np.delete(
+        sphere.faces,
+        [3, 700, 2222],
+        axis=0,
+    )
     holed = Mesh(sphere.vertices, few, allow_open=True)
     assert_array_equal(inside_grid(holed, axes), whole)
     cap = sphere.faces[sphere.vertices[sphere.faces, 2].mean(axis=1) < 0.75]
     used, faces = np.unique(cap, return_inverse=True)
-    bowl = Mesh(sphere.vertices[used], faces.reshape(-1, 3), allow_open=True)
-    winding = igl.winding_number(np.array(bowl.vertices), np.array(bowl.faces), grid_points(axes))
+    bowl = Mesh(
+        sphere.vertices[used],
+        faces.reshape(-1, 3),
+        allow_open=True,
+    )
+    winding = igl.winding_number(
+        np.array(bowl.vertices),
+        np.array(bowl.faces),
+        grid_points(axes),
+    )
     clear = np.abs(winding - 0.5) > 1e-6
     found = inside_grid(bowl, axes).ravel()[clear]
     expected = (winding > 0.5)[clear]
@@ -95,9 +139,15 @@ def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(spher
 
 
 def test_grid_moves_and_turns_with_the_mesh(blob):
-    turn = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=float)
+    turn = np.array(
+        [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],
+        dtype=float,
+    )
     shift = np.array([3.0, -40.0, 0.7])
-    moved = interior_samples(Mesh(blob.vertices @ turn.T + shift, blob.faces), 20)
+    moved = interior_samples(
+        Mesh(blob.vertices @ turn.T + shift, blob.faces),
+        20,
+    )
     expected = interior_samples(blob, 20) @ turn.T + shift
     moved = moved[np.lexsort(moved.round(6).T)]
     expected = expected[np.lexsort(expected.round(6).T)]
@@ -128,7 +178,10 @@ def test_limits_of_the_grid_are_named(blob):
 
 
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize(("depth", "n_inside"), [(5e-6, 16 * 16), (5e-7, 0)])
+@pytest.mark.parametrize(
+    ("depth", "n_inside"),
+    [(5e-6, 16 * 16), (5e-7, 0)],
+)
 def test_surface_is_as_thick_where_the_grid_has_one_layer(axis, depth, n_inside):
     # The cell centres of a plate lie so many cells below its two faces; closer than 1e-6 cells is on the surface.
     extents = np.roll([2 * depth / 16, 1.0, 1.0], axis)
@@ -139,7 +192,11 @@ def test_surface_is_as_thick_where_the_grid_has_one_layer(axis, depth, n_inside)
 
 
 @pytest.mark.parametrize(
-    ("resolution", "min_samples", "name"), [(0, 0, "resolution"), (4, -1, "min_samples")]
+    ("resolution", "min_samples", "name"),
+    [
+        (0, 0, "resolution"),
+        (4, -1, "min_samples"),
+    ],
 )
 def test_bad_arguments(blob, resolution, min_samples, name):
     with pytest.raises(ValueError, match=name):

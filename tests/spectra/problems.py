@@ -22,7 +22,11 @@ def cotangent_problem(mesh):
         stiffness = stiffness + sparse.csr_array(
             sparse.coo_array(entries, shape=(n_vertices, n_vertices))
         )
-    mass = np.bincount(mesh.faces.ravel(), np.repeat(mesh.area_faces / 3, 3), n_vertices)
+    mass = np.bincount(
+        mesh.faces.ravel(),
+        np.repeat(mesh.area_faces / 3, 3),
+        n_vertices,
+    )
     return stiffness, mass, np.array(mesh.vertices)
 
 

@@ -36,7 +36,10 @@ def assert_pairs(spectrum, problem, tolerance=1e-07):
     functions = spectrum.eigenfunctions
     assert np.all(np.diff(values) >= 0)
     residual = stiffness @ functions - mass[:, None] * functions * values
-    lengths = np.linalg.norm(residual / np.sqrt(mass)[:, None], axis=0)
+    lengths = np.linalg.norm(
+        residual / np.sqrt(mass)[:, None],
+        axis=0,
+    )
     assert (lengths / values).max() <= 2 * tolerance
     products = functions.T @ (mass[:, None] * functions)
     expected = np.eye(len(values))
@@ -57,7 +60,12 @@ def test_sphere_has_multiplets_of_odd_size():
     """l(l + 1) with multiplicity 2l + 1 on the unit sphere; the last multiplet is cut."""
     mesh = icosphere(subdivisions=4)
     problem = cotangent_problem(mesh)
-    spectrum = eigenpairs(problem[0], problem[1], 110, positions=problem[2])
+    spectrum = eigenpairs(
+        problem[0],
+        problem[1],
+        110,
+        positions=problem[2],
+    )
     degree = np.repeat(np.arange(1, 11), 2 * np.arange(1, 11) + 1)[:110]
     expected = degree * (degree + 1)
     assert_allclose(spectrum.eigenvalues, expected, rtol=0.045)
@@ -66,9 +74,17 @@ def test_sphere_has_multiplets_of_odd_size():
 
 def copies_of_a_patch(n_copies, side):
     """Identical square grids tied to one vertex: almost every eigenvalue has multiplicity n_copies − 1."""
-    path = sparse.diags_array([np.ones(side - 1), np.ones(side - 1)], offsets=[-1, 1])
+    path = sparse.diags_array(
+        [np.ones(side - 1), np.ones(side - 1)],
+        offsets=[-1, 1],
+    )
     grid = sparse.kron(path, sparse.eye_array(side)) + sparse.kron(sparse.eye_array(side), path)
-    copies = sparse.coo_array(sparse.kron(sparse.eye_array(n_copies), grid))
+    copies = sparse.coo_array(
+        sparse.kron(
+            sparse.eye_array(n_copies),
+            grid,
+        )
+    )
     tips = 1 + side**2 * np.arange(n_copies)
     hub = np.zeros_like(tips)
     rows = np.r_[copies.coords[0] + 1, hub, tips]
@@ -141,7 +157,12 @@ def test_a_large_basis_gives_its_place_to_the_eigenvectors(
 def test_scale_of_the_coordinates(scale, torus_problem):
     stiffness, mass, positions = torus_problem
     one = eigenpairs(stiffness, mass, 50, positions=positions)
-    other = eigenpairs(stiffness, mass * scale**2, 50, positions=positions * scale)
+    other = eigenpairs(
+        stiffness,
+        mass * scale**2,
+        50,
+        positions=positions * scale,
+    )
     found = other.eigenvalues * scale**2
     assert_allclose(found, one.eigenvalues, rtol=1e-10)
     assert_pairs(other, (stiffness, mass * scale**2, positions))
@@ -166,10 +187,17 @@ def test_positions_change_only_the_work(torus_problem):
 
 @pytest.mark.parametrize("n_vertices", [4, 12])
 def test_tiny_meshes(n_vertices):
-    tetrahedron = trimesh.Trimesh(np.eye(4)[:, :3], [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
+    tetrahedron = trimesh.Trimesh(
+        np.eye(4)[:, :3],
+        [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]],
+    )
     problem = cotangent_problem(tetrahedron if n_vertices == 4 else trimesh.creation.icosahedron())
     spectrum = eigenpairs(*problem[:2], n_vertices - 2)
-    values = eigh(problem[0].toarray(), np.diag(problem[1]), eigvals_only=True)
+    values = eigh(
+        problem[0].toarray(),
+        np.diag(problem[1]),
+        eigvals_only=True,
+    )
     expected = values[1:-1]
     assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
     assert_pairs(spectrum, problem)
@@ -177,14 +205,33 @@ def test_tiny_meshes(n_vertices):
 
 def test_flat_triangles_with_huge_cotangents():
     mesh = torus(jitter=0.0)
-    squashed = np.random.default_rng(3).choice(len(mesh.faces), 40, replace=False)
+    squashed = np.random.default_rng(3).choice(
+        len(mesh.faces),
+        40,
+        replace=False,
+    )
     for a, b, c in mesh.faces[squashed]:
         aside = 1e-5 * (mesh.vertices[a] - mesh.vertices[b])
         mesh.vertices[a] = (mesh.vertices[b] + mesh.vertices[c]) / 2 + aside
-    problem = cotangent_problem(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
+    problem = cotangent_problem(
+        trimesh.Trimesh(
+            mesh.vertices,
+            mesh.faces,
+            process=False,
+        )
+    )
     assert abs(problem[0]).max() > 1e3
-    spectrum = eigenpairs(problem[0], problem[1], 80, positions=problem[2])
-    values = eigh(problem[0].toarray(), np.diag(problem[1]), eigvals_only=True)
+    spectrum = eigenpairs(
+        problem[0],
+        problem[1],
+        80,
+        positions=problem[2],
+    )
+    values = eigh(
+        problem[0].toarray(),
+        np.diag(problem[1]),
+        eigvals_only=True,
+    )
     expected = values[1:81]
     assert_allclose(spectrum.eigenvalues, expected, rtol=1e-7)
 
@@ -219,7 +266,10 @@ def test_incomplete_or_wrong_pairs_are_not_returned(torus_problem, monkeypatch):
     """Whoever found them."""
     stiffness, mass, _ = torus_problem
     right = eigenpairs(stiffness, mass, 30 + eigensolver.N_GUARDS)
-    found = [np.delete(right.eigenvalues, 4), np.delete(right.eigenfunctions, 4, axis=1)]
+    found = [
+        np.delete(right.eigenvalues, 4),
+        np.delete(right.eigenfunctions, 4, axis=1),
+    ]
     monkeypatch.setattr(eigensolver, "lanczos", fail)
     monkeypatch.setattr(eigensolver, "_arpack", lambda *arguments: found)
     with pytest.raises(ConvergenceError, match="found 30 of 31"):
@@ -238,12 +288,20 @@ def test_the_residual_is_that_of_the_worst_pair(n_eigenpairs, torus_problem):
     functions = spectrum.eigenfunctions
     defect = stiffness @ functions - mass[:, None] * functions * values
     expected = np.linalg.norm(defect / np.sqrt(mass)[:, None], axis=0) / values
-    assert spectrum.residual == pytest.approx(expected.max(), rel=1e-2, abs=1e-12)
+    assert spectrum.residual == pytest.approx(
+        expected.max(),
+        rel=1e-2,
+        abs=1e-12,
+    )
     assert 0 < spectrum.residual < 1e-4
 
 
 @pytest.mark.parametrize(
-    "pack", [sparse.diags_array, lambda mass: sparse.csc_matrix(np.diag(mass))]
+    "pack",
+    [
+        sparse.diags_array,
+        lambda mass: sparse.csc_matrix(np.diag(mass)),
+    ],
 )
 def test_mass_may_be_a_diagonal_matrix(pack, torus_problem):
     stiffness, mass, positions = torus_problem
@@ -258,16 +316,27 @@ def test_takes_the_matrices_of_other_libraries():
     mesh = torus(32, 16)
     vertices = np.array(mesh.vertices)
     faces = np.array(mesh.faces)
-    solver = lapy.Solver(lapy.TriaMesh(vertices, faces), lump=True, use_cholmod=False)
+    solver = lapy.Solver(
+        lapy.TriaMesh(vertices, faces),
+        lump=True,
+        use_cholmod=False,
+    )
     values = solver.eigs(25)[0][1:]
     of_lapy = eigenpairs(solver.stiffness, solver.mass, 24)
     # LaPy computes in single precision
     assert_allclose(of_lapy.eigenvalues, values, rtol=1e-5)
-    of_igl = eigenpairs(-igl.cotmatrix(vertices, faces), igl.massmatrix(vertices, faces, 0), 24)
+    of_igl = eigenpairs(
+        -igl.cotmatrix(vertices, faces),
+        igl.massmatrix(vertices, faces, 0),
+        24,
+    )
     assert_allclose(of_igl.eigenvalues, values, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("length", "usable"), [(400, True), (8000, False)])
+@pytest.mark.parametrize(
+    ("length", "usable"),
+    [(400, True), (8000, False)],
+)
 def test_rounding_excuses_only_a_small_residual(length, usable):
     """A needle's cotangents: what rounding allows grows with the square of its length, what is accepted does not."""
     needle = trimesh.creation.cylinder(0.2, length, sections=300)
@@ -290,7 +359,12 @@ def test_arguments_are_left_alone(torus_problem):
 
 def test_two_components_are_counted_at_any_scale():
     one = icosphere(subdivisions=2)
-    two = trimesh.util.concatenate([one, one.copy().apply_translation([3, 0, 0])])
+    two = trimesh.util.concatenate(
+        [
+            one,
+            one.copy().apply_translation([3, 0, 0]),
+        ]
+    )
     for scale in (1e-6, 1, 1e6):
         stiffness, mass, _ = cotangent_problem(two)
         with pytest.raises(ValueError, match="expected 1 connected component, got 2"):
@@ -302,7 +376,11 @@ def test_components_tied_by_rounding_alone_are_counted():
     both = sparse.lil_array(sparse.block_diag([stiffness, stiffness]))
     both[0, len(mass)] = both[len(mass), 0] = -1e-17
     with pytest.raises(ValueError, match="expected 1 connected component, got 2"):
-        eigenpairs(sparse.csr_array(both), np.r_[mass, mass], 10)
+        eigenpairs(
+            sparse.csr_array(both),
+            np.r_[mass, mass],
+            10,
+        )
 
 
 def test_what_is_refused(torus_problem):
@@ -310,7 +388,11 @@ def test_what_is_refused(torus_problem):
     n_vertices = len(mass)
 
     def changed(value):
-        return np.where(np.arange(n_vertices) == 3, value, mass)
+        return np.where(
+            np.arange(n_vertices) == 3,
+            value,
+            mass,
+        )
 
     broken = stiffness.copy()
     broken.data[5] = np.nan
@@ -342,4 +424,8 @@ def test_what_is_refused(torus_problem):
     with pytest.raises(ValueError, match=r"not diagonal\. Lump it"):
         eigenpairs(stiffness, abs(stiffness), 5)
     with pytest.raises(ValueError, match="not diagonal"):
-        eigenpairs(stiffness, sparse.diags_array(mass).tocsr()[:, :-1], 5)
+        eigenpairs(
+            stiffness,
+            sparse.diags_array(mass).tocsr()[:, :-1],
+            5,
+        )

@@ -57,7 +57,10 @@ def drawn(figures_of):
 def embedding(mesh, points, n_eigenpairs):
     """The first three eigenvalues, and the commute-time embedding by dense linear algebra."""
     stiffness, mass = laplacian(mesh)
-    values, functions = scipy.linalg.eigh(stiffness.toarray(), np.diag(mass))
+    values, functions = scipy.linalg.eigh(
+        stiffness.toarray(),
+        np.diag(mass),
+    )
     kept = slice(1, n_eigenpairs + 1)
     weights = np.asarray(mean_value_coordinates(mesh.vertices, mesh.faces, points))
     return weights @ (functions[:, kept] / np.sqrt(values[kept]))
@@ -133,7 +136,10 @@ def test_topology_measures_the_change_of_the_same_pairs(open_ring, tmp_path, dra
     assert f"{len(points)} interior samples, {len(change)} pairs, 30 eigenpairs" in printed
     for limit in (3, 10, 14):
         (share,) = re.findall(rf"less than {limit} %: (\S+) %", printed)
-        expected = pytest.approx(100 * np.mean(change < limit), abs=0.2)
+        expected = pytest.approx(
+            100 * np.mean(change < limit),
+            abs=0.2,
+        )
         assert float(share) == expected
     (largest,) = re.findall(r"largest change: (\S+) %", printed)
     assert float(largest) == pytest.approx(change.max(), rel=0.01)
@@ -179,15 +185,25 @@ def test_potential_is_least_in_the_middle(tmp_path, drawn):
     centre = found.barycentroid
     assert_allclose(np.abs(centre), [7, 6], atol=0.02)
     x, y = found.axes
-    grid_x, grid_y = np.meshgrid(x - centre[0], y - centre[1], indexing="ij")
+    grid_x, grid_y = np.meshgrid(
+        x - centre[0],
+        y - centre[1],
+        indexing="ij",
+    )
     ellipse = np.sqrt(grid_x**2 + (grid_y / 2) ** 2)
     inside = ~np.isnan(found.values)
     assert inside[ellipse < 0.97].all()
     assert not inside[ellipse > 1.01].any()
-    outline = np.linalg.norm((found.section - centre) / [1, 2], axis=2)
+    outline = np.linalg.norm(
+        (found.section - centre) / [1, 2],
+        axis=2,
+    )
     assert outline == pytest.approx(1, abs=0.02)
     places = np.array([[5.0, 6.0, 7.0], [5.0, 7.5, 7.0]])
-    exact = np.linalg.norm(embedding(mesh, places, 40), axis=1)
+    exact = np.linalg.norm(
+        embedding(mesh, places, 40),
+        axis=1,
+    )
     expected = pytest.approx(exact[0], rel=0.01)
     assert np.nanmin(found.values) == expected
     i = int(np.argmin(np.abs(x - centre[0])))

@@ -47,6 +47,14 @@ def test_all_crossings_are_found(seed):
 def test_two_balls():
     ball = trimesh.creation.icosphere(2)
     for gap, crossed in ((2.1, False), (1.5, True)):
-        both = trimesh.util.concatenate([ball, ball.copy().apply_translation([gap, 0.013, 0.007])])
-        found = crossing_faces(np.asarray(both.vertices), np.asarray(both.faces))
+        both = trimesh.util.concatenate(
+            [
+                ball,
+                ball.copy().apply_translation([gap, 0.013, 0.007]),
+            ]
+        )
+        found = crossing_faces(
+            np.asarray(both.vertices),
+            np.asarray(both.faces),
+        )
         assert bool(len(found)) == crossed

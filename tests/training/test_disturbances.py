@@ -89,7 +89,10 @@ def test_clip_takes_a_cap_off_a_ball(sphere):
     lost_area = 2 * np.pi * height - np.pi * height * (2 - height)
     assert sphere.area - cut.area == pytest.approx(lost_area, rel=0.05)
     # All that remains is where it was.
-    radius = norm(cut.vertices - turned.vertices.mean(axis=0), axis=1)
+    radius = norm(
+        cut.vertices - turned.vertices.mean(axis=0),
+        axis=1,
+    )
     assert_allclose(radius.max(), 1, atol=1e-6)
 
 
@@ -104,7 +107,10 @@ def test_clip_keeps_the_largest_piece():
     cut = clip(mesh, 0.8)
     assert cut.vertices[:, 1].min() > 0  # both ends remain; the thinner one is on the other side
     found = cut.vertices[:, 0].max()
-    expected = pytest.approx(stretched[:, 0].max(), abs=0.05)
+    expected = pytest.approx(
+        stretched[:, 0].max(),
+        abs=0.05,
+    )
     assert found == expected
     assert 0 < cut.volume < 0.3 * mesh.volume
     with pytest.raises(ValueError, match="share"):

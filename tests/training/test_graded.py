@@ -43,7 +43,11 @@ BENDING = [
 
 
 def drawn(kind, number=0):
-    body = draw_body(CLASSES[FIRST[kind]], [2, number], [0, number])
+    body = draw_body(
+        CLASSES[FIRST[kind]],
+        [2, number],
+        [0, number],
+    )
     return draw_pose(body, default_rng([1, number]), 3000)
 
 
@@ -90,7 +94,11 @@ def test_animals_bend_and_things_do_not(poses):
     """The greatest change of a distance between two vertices, over the body's extent."""
 
     def change(pose):
-        some = default_rng(0).choice(len(pose.rest), 300, replace=False)
+        some = default_rng(0).choice(
+            len(pose.rest),
+            300,
+            replace=False,
+        )
         rest = pdist(pose.rest[some])
         bent = pdist(pose.bent[some])
         return float(np.abs(rest - bent).max() / rest.max())
@@ -202,7 +210,13 @@ def test_the_other_generator_is_as_it_was():
 
 
 def test_write_makes_folders_of_classes_and_bodies(tmp_path):
-    shapes = GradedShapes(1, 2, 2, seed=4, n_vertices=(1600, 2000))
+    shapes = GradedShapes(
+        1,
+        2,
+        2,
+        seed=4,
+        n_vertices=(1600, 2000),
+    )
     shapes.write(tmp_path, n_workers=2)
     files = find_bodies(tmp_path)
     assert files.names == tuple(f"{name}.off" for name in shapes.names)
@@ -260,7 +274,11 @@ def counted_volume(solid):
 
 def test_a_plate_has_its_volume():
     """A stadium with a round hole; the rounded rim takes off little."""
-    plate = Plate(((-0.5, 0.0, 0.5, 0.0, 0.4, 0.4),), ((0.2, 0.0, 0.2),), 0.2)
+    plate = Plate(
+        ((-0.5, 0.0, 0.5, 0.0, 0.4, 0.4),),
+        ((0.2, 0.0, 0.2),),
+        0.2,
+    )
     area = 0.8 + np.pi * 0.4**2 - np.pi * 0.2**2
     assert plate.genus == 1
     assert 0.94 * area * 0.2 < counted_volume(plate) < area * 0.2

@@ -14,7 +14,14 @@ N_INDIVIDUALS = 3
 
 @pytest.fixture(scope="module")
 def shapes():
-    return GradedShapes(2, 1, 2, seed=3, n_vertices=(1500, 1800), n_individuals=N_INDIVIDUALS)
+    return GradedShapes(
+        2,
+        1,
+        2,
+        seed=3,
+        n_vertices=(1500, 1800),
+        n_individuals=N_INDIVIDUALS,
+    )
 
 
 def test_individuals_are_changed_by_a_hundredth_to_a_twentieth_of_the_root_of_the_area(shapes):
@@ -61,6 +68,12 @@ def test_poses_of_individuals_are_bodies_that_names_tell_apart(shapes):
 
 
 def test_without_individuals_names_are_class_body_and_pose():
-    plain = GradedShapes(1, 1, 1, seed=3, n_vertices=(1500, 1800))
+    plain = GradedShapes(
+        1,
+        1,
+        1,
+        seed=3,
+        n_vertices=(1500, 1800),
+    )
     assert plain.names == [f"{plain.class_names[0]}/00/00"]
     assert individual_of(plain.names[0]) == body_of(plain.names[0]) == f"{plain.class_names[0]}/00"

@@ -15,7 +15,12 @@ def test_points_of_a_moved_body_are_moved_back():
     ball = trimesh.creation.icosphere(subdivisions=2)
     turn = Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix()
     bent = ball.vertices @ turn.T + [1.0, 2.0, 3.0]
-    pose = Pose(np.asarray(ball.vertices), bent, np.asarray(ball.faces), 0.0)
+    pose = Pose(
+        np.asarray(ball.vertices),
+        bent,
+        np.asarray(ball.faces),
+        0.0,
+    )
     points = default_rng(0).uniform(-0.5, 0.5, (50, 3))
     found = at_rest(points @ turn.T + [1.0, 2.0, 3.0], pose)
     np.testing.assert_allclose(found, points, atol=1e-9)

@@ -28,7 +28,16 @@ def chain(seed, n=70):
         positions.append(positions[-1] + 1.5 * direction + 0.4 * winding)
     at = np.array(positions)
     none = np.zeros(n)
-    return Molecule(f"{seed}", at, none, none, np.arange(n), ("ALA",) * n, at, none)
+    return Molecule(
+        f"{seed}",
+        at,
+        none,
+        none,
+        np.arange(n),
+        ("ALA",) * n,
+        at,
+        none,
+    )
 
 
 CHAINS = [chain(seed) for seed in range(6)]
@@ -45,7 +54,11 @@ def test_families_share_folds_and_compositions_cross_them():
 
 def test_threading_changes_the_residues_and_not_the_fold():
     generator = default_rng(0)
-    made = program.threaded(CHAINS[0], np.full(20, 0.05), generator)
+    made = program.threaded(
+        CHAINS[0],
+        np.full(20, 0.05),
+        generator,
+    )
     assert len(set(made.residue_names)) > 10
     found = float(program.fold_distances([CHAINS[0], made])[0, 1])
     assert found == 0
@@ -85,13 +98,23 @@ def test_deformed_and_permuted_chains_move_as_far_as_told():
     assert abs(shift - np.hypot(program.FLUCTUATION, program.NOISE * 3**0.5)) < 0.5
     turned = program.permuted(CHAINS[3], generator)
     assert turned.places.tolist() == list(range(70))
-    steps = norm(np.diff(turned.residue_positions, axis=0), axis=1)
+    steps = norm(
+        np.diff(turned.residue_positions, axis=0),
+        axis=1,
+    )
     assert (steps > 6).sum() <= 3  # the ends that were joined
 
 
 def test_relatives_are_backbones_without_some_ends(tmp_path):
     generator = default_rng(1)
-    offsets = np.array([[-1.2, 0.5, 0], [0, 0, 0], [0.9, 1.1, 0], [0.3, 2.2, 0.4]])
+    offsets = np.array(
+        [
+            [-1.2, 0.5, 0],
+            [0, 0, 0],
+            [0.9, 1.1, 0],
+            [0.3, 2.2, 0.4],
+        ]
+    )
     positions = CHAINS[4].residue_positions[:, None] + offsets
     names = generator.choice(program.AMINO_ACIDS, 70).tolist()
     shares_program.write_changed(tmp_path, positions, names, generator)

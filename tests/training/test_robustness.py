@@ -25,9 +25,24 @@ ROOT = "own_descriptors:Root"
 
 def test_the_table_holds_mean_movements_over_the_distance_between_classes(tmp_path, capsys):
     def sizes_in(folder, heights):
-        return [root_area(write_egg(tmp_path / folder / f"{x}.off", x, 2)) for x in heights]
+        return [
+            root_area(
+                write_egg(
+                    tmp_path / folder / f"{x}.off",
+                    x,
+                    2,
+                )
+            )
+            for x in heights
+        ]
 
-    meshes = [write_egg(tmp_path / f"{height}.off", height) for height in (1.0, 1.5, 3.0)]
+    meshes = [
+        write_egg(
+            tmp_path / f"{height}.off",
+            height,
+        )
+        for height in (1.0, 1.5, 3.0)
+    ]
     low = sizes_in("gallery/low", (1.0, 1.3))
     high = sizes_in("gallery/high", (2.0, 2.4))
     poses = sizes_in("poses", (1.0, 1.1, 1.3))
@@ -35,16 +50,32 @@ def test_the_table_holds_mean_movements_over_the_distance_between_classes(tmp_pa
     header, row, *rest = capsys.readouterr().out.splitlines()
     assert header.split() == [*DISTURBANCES, "pose"]
     name, *cells = row.split()
-    found = dict(zip(header.split(), map(float, cells), strict=True))
+    found = dict(
+        zip(
+            header.split(),
+            map(float, cells),
+            strict=True,
+        )
+    )
 
     unit = np.median(np.subtract.outer(high, low))
     sizes = [root_area(mesh) for mesh in meshes]
     assert name == "root"
-    expected = pytest.approx(100 * 6 * np.mean(sizes) / unit, rel=1e-3)
+    expected = pytest.approx(
+        100 * 6 * np.mean(sizes) / unit,
+        rel=1e-3,
+    )
     assert found["scale"] == expected
     assert found["motion"] == pytest.approx(0, abs=0.1)
-    between_poses = [poses[1] - poses[0], poses[2] - poses[0], poses[2] - poses[1]]
-    expected = pytest.approx(100 * np.mean(between_poses) / unit, rel=1e-2)
+    between_poses = [
+        poses[1] - poses[0],
+        poses[2] - poses[0],
+        poses[2] - poses[1],
+    ]
+    expected = pytest.approx(
+        100 * np.mean(between_poses) / unit,
+        rel=1e-2,
+    )
     assert found["pose"] == expected
     halves = [np.sqrt(DISTURBANCES["half"].apply(load_mesh(path)).area) for path in meshes]
     moved = np.mean(np.abs(np.subtract(halves, sizes)))
@@ -67,7 +98,11 @@ def test_real_descriptors_on_a_body_with_a_gap(tmp_path):
     (answers,) = describe_disturbed([path], chosen, n_workers=1)
 
     def movement(descriptor, column):
-        ((found,), _) = movements(descriptor, [answers[descriptor.name]], column)
+        ((found,), _) = movements(
+            descriptor,
+            [answers[descriptor.name]],
+            column,
+        )
         return found
 
     # The weld makes the ring whole, which distances along the body notice and straight ones do not.

@@ -159,7 +159,11 @@ def test_a_checkpoint_is_scored_as_by_the_librarys_parts(root, tmp_path):
     best = RetrievalLearner.load_from_checkpoint(out / "checkpoints" / "best.ckpt").eval()
     expected = igps.describe(data.dataset, best.descriptor)
     torch.testing.assert_close(igps.describe(data.dataset, layout), expected)
-    split = Split(data.split.train + data.split.validation, (), data.split.test)
+    split = Split(
+        data.split.train + data.split.validation,
+        (),
+        data.split.test,
+    )
     train_part = torch.tensor(split.train)
     test = torch.tensor(split.test)
     tested = histograms[test]

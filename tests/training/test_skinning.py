@@ -15,23 +15,46 @@ from igps.shapes.solids import Blob
 
 def cylinder(length, radius):
     """A round bar along z from 0, of triangles much smaller than it is thick."""
-    outline = [(0, 0), *((radius, z) for z in np.linspace(0, length, 121)), (0, length)]
+    outline = [
+        (0, 0),
+        *((radius, z) for z in np.linspace(0, length, 121)),
+        (0, length),
+    ]
     return trimesh.creation.revolve(outline, sections=48)
 
 
 def straight_rod(length, radius, n=61):
     along = np.linspace(0.0, length, n)
-    points = np.stack([0 * along, 0 * along, along], axis=1)
+    points = np.stack(
+        [0 * along, 0 * along, along],
+        axis=1,
+    )
     sides = np.tile(np.eye(3)[:, :2], (n, 1, 1))
-    return Rod(-1, 0.0, points, along, np.full(n, radius), np.full(n, radius), sides)
+    return Rod(
+        -1,
+        0.0,
+        points,
+        along,
+        np.full(n, radius),
+        np.full(n, radius),
+        sides,
+    )
 
 
 def bent_bar(turns):
     bar = cylinder(3.0, 0.2)
     rod = straight_rod(3.0, 0.2, len(turns))
     rig = Rig((rod,), np.zeros(1, dtype=np.int64))
-    binding = Binding(np.ones((len(bar.vertices), 1)), bar.vertices[:, 2:3])
-    vertices = bend(bar.vertices, rig, binding, rod_motions(rig, [turns]))
+    binding = Binding(
+        np.ones((len(bar.vertices), 1)),
+        bar.vertices[:, 2:3],
+    )
+    vertices = bend(
+        bar.vertices,
+        rig,
+        binding,
+        rod_motions(rig, [turns]),
+    )
     return bar, trimesh.Trimesh(vertices, bar.faces, process=False)
 
 
@@ -64,17 +87,34 @@ def test_a_hinge_keeps_lengths_near_both_bones():
     z = bar.vertices[:, 2]
     shape = np.zeros(1), np.ones(1), np.ones(1), np.zeros((1, 3, 2))
     first = Rod(-1, 0.0, np.zeros((1, 3)), *shape)
-    second = Rod(0, 0.0, np.array([[0, 0, 1.5]]), *shape)
+    second = Rod(
+        0,
+        0.0,
+        np.array([[0, 0, 1.5]]),
+        *shape,
+    )
     rig = Rig((first, second), np.arange(2))
     share = np.clip((z - 1.2) / 0.6, 0.0, 1.0)
-    binding = Binding(np.stack([1 - share, share], axis=1), np.zeros((len(z), 2)))
-    motions = rod_motions(rig, [np.zeros((1, 3)), np.array([[1.2, 0.0, 0.0]])])
+    binding = Binding(
+        np.stack([1 - share, share], axis=1),
+        np.zeros((len(z), 2)),
+    )
+    motions = rod_motions(
+        rig,
+        [np.zeros((1, 3)), np.array([[1.2, 0.0, 0.0]])],
+    )
     bent = bend(bar.vertices, rig, binding, motions)
     edges = bar.edges_unique
     outside = edges[(np.abs(z[edges] - 1.5) > 0.31).all(axis=1)]
     assert len(outside) > 1000
-    before = np.linalg.norm(np.diff(bar.vertices[outside], axis=1), axis=2)
-    after = np.linalg.norm(np.diff(bent[outside], axis=1), axis=2)
+    before = np.linalg.norm(
+        np.diff(bar.vertices[outside], axis=1),
+        axis=2,
+    )
+    after = np.linalg.norm(
+        np.diff(bent[outside], axis=1),
+        axis=2,
+    )
     assert_allclose(after, before, rtol=1e-9)
     top = z > 1.85
     joint = np.array([0, 0, 1.5])
@@ -83,9 +123,20 @@ def test_a_hinge_keeps_lengths_near_both_bones():
 
 
 def test_weights_are_shares_and_follow_the_nearest_rod():
-    arm = limb("arm", [0.6, 0.6], [0.15, 0.13, 0.12], [(20, 10), (25, 0)])
+    arm = limb(
+        "arm",
+        [0.6, 0.6],
+        [0.15, 0.13, 0.12],
+        [(20, 10), (25, 0)],
+    )
     hub = Blob((0.4, 0.4, 0.4))
-    arms = tuple(arm.joined((0, 0, 0.3 * side), (0, 0, side)) for side in (-1, 1))
+    arms = tuple(
+        arm.joined(
+            (0, 0, 0.3 * side),
+            (0, 0, side),
+        )
+        for side in (-1, 1)
+    )
     skeleton = Skeleton(Part(hub, children=arms))
     bones = bones_at_rest(skeleton, {})
     rig = limb_rig(bones)
@@ -95,7 +146,12 @@ def test_weights_are_shares_and_follow_the_nearest_rod():
     ball = trimesh.creation.icosphere(4, 0.4).apply_translation([2, 0, 0])
     both = trimesh.util.concatenate([bar, ball])
     solids = [bone.placed for bone in bones]
-    binding = bind(np.asarray(both.vertices), np.asarray(both.faces), rig, solids)
+    binding = bind(
+        np.asarray(both.vertices),
+        np.asarray(both.faces),
+        rig,
+        solids,
+    )
     assert_allclose(binding.weights.sum(axis=1), 1.0)
     assert (binding.weights >= 0.0).all()
     z = bar.vertices[:, 2]
@@ -116,7 +172,13 @@ def test_weights_are_shares_and_follow_the_nearest_rod():
 
 def test_trunks_bend_and_frames_do_not():
     """A wheel without limbs has no joint at all; the trunk of a four-legged animal is a rod, its legs too."""
-    wheel = KINDS["wheel"].build(np.random.default_rng(0), 4, 3, "none", "plain")
+    wheel = KINDS["wheel"].build(
+        np.random.default_rng(0),
+        4,
+        3,
+        "none",
+        "plain",
+    )
     for rod in limb_rig(bones_at_rest(wheel, {})).rods:
         assert len(rod.arc_lengths) == 1
     rods = limb_rig(bones_at_rest(TEMPLATES["quadruped"](), {})).rods

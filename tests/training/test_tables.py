@@ -17,7 +17,10 @@ def test_a_table_is_of_the_signatures_of_today(page, name):
     assert version == SignatureConfig.ALGORITHM_VERSION, f"{page}: measure {name} again"
 
 
-@pytest.mark.parametrize("page", sorted({page for page, _ in SHOWN}))
+@pytest.mark.parametrize(
+    "page",
+    sorted({page for page, _ in SHOWN}),
+)
 def test_a_page_shows_what_was_measured(page):
     remedy = "write it by python -m docs.benchmarks.tables"
     assert tables.with_tables(PAGES[page]) == PAGES[page], remedy

@@ -8,7 +8,11 @@ from igps.duplicates.calibration import Threshold
 
 
 def test_a_threshold_lies_between_what_does_not_overlap():
-    found = threshold_between([0.001, 0.004], [0.016, 0.5, np.inf], 0.001)
+    found = threshold_between(
+        [0.001, 0.004],
+        [0.016, 0.5, np.inf],
+        0.001,
+    )
     assert found == Threshold(0.008, 3, 0, 2, 2)
 
 
@@ -26,7 +30,11 @@ def test_where_they_overlap_the_rate_decides():
 
 def test_a_threshold_may_be_as_large_as_the_rate_allows():
     """Of ten others one in ten is allowed: all up to the second nearest, and not that one."""
-    found = threshold_at([1.0, 2.0, 7.5], np.arange(5.0, 15.0), 0.1)
+    found = threshold_at(
+        [1.0, 2.0, 7.5],
+        np.arange(5.0, 15.0),
+        0.1,
+    )
     assert found.distance == pytest.approx(6.0)
     assert found.distance < 6.0
     assert found.n_false == 1

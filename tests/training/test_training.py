@@ -51,12 +51,19 @@ def expected_scores(histograms, labels, split, part_cells):
     tested = histograms[test]
     scores = {"none": percents(chi_square(tested, tested), labels[test])}
     for name, head in (("whitened", WhitenedHead()), ("kernel", KernelHead())):
-        vectors = head.fit(histograms[train], labels[train], part_cells)(tested)
+        vectors = head.fit(
+            histograms[train],
+            labels[train],
+            part_cells,
+        )(tested)
         scores[name] = percents(1 - vectors @ vectors.T, labels[test])
     return scores
 
 
-@pytest.mark.parametrize(("name", "protocol"), [("interior", "unseen"), ("rich", "seen")])
+@pytest.mark.parametrize(
+    ("name", "protocol"),
+    [("interior", "unseen"), ("rich", "seen")],
+)
 def test_splits_are_scored_as_by_the_librarys_parts(root, name, protocol, capsys):
     n_train = 3 if protocol == "seen" else 2
     seeds = (100, 101)
@@ -98,7 +105,11 @@ def test_a_metric_is_the_prior_of_the_heads(root, capsys):
     split = split_unseen(labels, 2, seed=100)
     train = torch.tensor(split.train)
     test = torch.tensor(split.test)
-    head = WhitenedHead().fit(histograms[train], labels[train], module.descriptor.part_cells)
+    head = WhitenedHead().fit(
+        histograms[train],
+        labels[train],
+        module.descriptor.part_cells,
+    )
     whitened = head(histograms[test])
     own = 1 - whitened @ whitened.T
     prior = 1 - vectors[test] @ vectors[test].T
@@ -109,7 +120,10 @@ def test_a_metric_is_the_prior_of_the_heads(root, capsys):
     for name, distances in by_row.items():
         means = printed[name][::2]
         deviations = printed[name][1::2]
-        assert means == pytest.approx(percents(distances, labels[test]), abs=0.06), name
+        assert means == pytest.approx(
+            percents(distances, labels[test]),
+            abs=0.06,
+        ), name
         assert not any(deviations)
 
 
@@ -132,7 +146,16 @@ class QuickShapes(GradedShapes):
         vertices = shape.vertices * [1, 1 + 0.05 * place, 1]
         name = self.names[index]
         label = self.labels[index]
-        return GradedShape(vertices, shape.faces, label, body_of(name), name, 0, np.eye(3), ())
+        return GradedShape(
+            vertices,
+            shape.faces,
+            label,
+            body_of(name),
+            name,
+            0,
+            np.eye(3),
+            (),
+        )
 
 
 def test_pretraining_saves_a_metric_and_measures_it(root, tmp_path, monkeypatch, capsys):

@@ -12,7 +12,11 @@ from scipy.spatial.transform import Rotation
 def test_an_unchanged_surface_takes_the_poses():
     rest, faces = _rod()
     bent = _bend(rest)
-    for moved, pose in zip(transfer(rest, [rest, bent], rest, faces), [rest, bent], strict=True):
+    for moved, pose in zip(
+        transfer(rest, [rest, bent], rest, faces),
+        [rest, bent],
+        strict=True,
+    ):
         np.testing.assert_allclose(_centred(moved), _centred(pose), atol=1e-9)
 
 
@@ -20,7 +24,12 @@ def test_a_rigid_pose_moves_the_changed_surface_rigidly():
     rest, faces = _rod()
     changed = rest * [1.1, 0.9, 1.2] + 0.05 * np.sin(3 * rest[:, [1, 2, 0]])
     turn = Rotation.from_euler("xyz", [0.3, 1.2, -0.5])
-    (moved,) = transfer(rest, [turn.apply(rest) + 5.0], changed, faces)
+    (moved,) = transfer(
+        rest,
+        [turn.apply(rest) + 5.0],
+        changed,
+        faces,
+    )
     expected = _centred(turn.apply(changed))
     np.testing.assert_allclose(_centred(moved), expected, atol=1e-9)
 
@@ -30,8 +39,14 @@ def test_the_changed_surface_bends_with_the_pose():
     rest, faces = _rod()
     changed = rest * [1.1, 1.1, 1.0]
     (moved,) = transfer(rest, [_bend(rest)], changed, faces)
-    errors = np.linalg.norm(_centred(moved) - _centred(_bend(changed)), axis=1)
-    changes = np.linalg.norm(_centred(moved) - _centred(_bend(rest)), axis=1)
+    errors = np.linalg.norm(
+        _centred(moved) - _centred(_bend(changed)),
+        axis=1,
+    )
+    changes = np.linalg.norm(
+        _centred(moved) - _centred(_bend(rest)),
+        axis=1,
+    )
     assert errors.max() < 0.02
     assert changes.max() > 0.04
 
@@ -65,7 +80,10 @@ def _bend(points):
     """Bend the z axis into an arc of radius 4, perpendicular slices staying flat."""
     angles = points[:, 2] / 4.0
     radii = 4.0 + points[:, 0]
-    return np.stack([radii * np.cos(angles), points[:, 1], radii * np.sin(angles)], axis=1)
+    return np.stack(
+        [radii * np.cos(angles), points[:, 1], radii * np.sin(angles)],
+        axis=1,
+    )
 
 
 def _centred(points):

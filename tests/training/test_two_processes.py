@@ -68,7 +68,10 @@ def in_two_processes(work):
 
 def test_scores_on_two_processes_are_those_on_one(module, tmp_path):
     seed_everything(3, verbose=False)
-    axes = [Potential(2, learnable=True), InteriorDistance(16, learnable=True)]
+    axes = [
+        Potential(2, learnable=True),
+        InteriorDistance(16, learnable=True),
+    ]
     descriptor = HistogramDescriptor(PairHistogram(axes, SpectralEmbedding()))
     distance = BlendedDistance(ProjectionHead(width=8, n_hidden=16))
     model = RetrievalLearner(descriptor, distance)

@@ -21,7 +21,11 @@ def grooved_ball():
     body = trimesh.creation.icosphere(subdivisions=3)
     z = body.vertices[:, 2:]
     body.vertices[:, :2] *= 2 - 0.5 * np.exp(-((z / 0.12) ** 2))
-    body.vertices *= np.random.default_rng(0).uniform(0.99, 1.01, (len(body.vertices), 1))
+    body.vertices *= np.random.default_rng(0).uniform(
+        0.99,
+        1.01,
+        (len(body.vertices), 1),
+    )
     return Mesh(body.vertices, body.faces, name="grooved_ball")
 
 
@@ -30,7 +34,10 @@ def paths(mesh):
     surface = as_trimesh(mesh)
     n = len(mesh.vertices)
     edges = tuple(surface.edges_unique.T)
-    graph = sparse.coo_matrix((surface.edges_unique_length, edges), shape=(n, n))
+    graph = sparse.coo_matrix(
+        (surface.edges_unique_length, edges),
+        shape=(n, n),
+    )
     return shortest_path(graph.tocsr(), directed=False)
 
 

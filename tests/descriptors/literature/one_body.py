@@ -9,8 +9,19 @@ from igps.signature.signature import Samples
 
 def of_mesh(mesh):
     """A body of which the mesh is known, and no sample and no eigenpair: a descriptor that reads them fails."""
-    nothing = Samples(np.zeros((0, 3)), np.zeros((0, 0), dtype=np.float32))
-    return Body(np.zeros(0), nothing, nothing, mesh.area, mesh.volume, mesh.name, mesh)
+    nothing = Samples(
+        np.zeros((0, 3)),
+        np.zeros((0, 0), dtype=np.float32),
+    )
+    return Body(
+        np.zeros(0),
+        nothing,
+        nothing,
+        mesh.area,
+        mesh.volume,
+        mesh.name,
+        mesh,
+    )
 
 
 def of_signature(signature):
@@ -20,8 +31,14 @@ def of_signature(signature):
 
 def of_points(points, area=1.0, eigenvalues=None):
     """A body of which the samples of the surface, the area and the eigenvalues are known, and nothing else."""
-    samples = Samples(points, np.zeros((len(points), 1), dtype=np.float32))
-    nothing = Samples(np.zeros((0, 3)), np.zeros((0, 1), dtype=np.float32))
+    samples = Samples(
+        points,
+        np.zeros((len(points), 1), dtype=np.float32),
+    )
+    nothing = Samples(
+        np.zeros((0, 3)),
+        np.zeros((0, 1), dtype=np.float32),
+    )
     return Body(
         np.ones(1) if eigenvalues is None else eigenvalues,
         nothing,

@@ -31,28 +31,54 @@ def distance(a, b, descriptor):
 
 def sheet(curvature):
     """A thin sheet of 2 × 1, rolled up along its length to a circular arc of the given curvature."""
-    along, across = np.meshgrid(np.linspace(0, 2, 33), np.linspace(0, 1, 17), indexing="ij")
+    along, across = np.meshgrid(
+        np.linspace(0, 2, 33),
+        np.linspace(0, 1, 17),
+        indexing="ij",
+    )
     u = along.ravel()
     v = across.ravel()
     inner = np.stack([u, v, 0 * u], axis=1)
     if curvature:
         inner[:, 0] = np.sin(curvature * u) / curvature
         inner[:, 2] = (1 - np.cos(curvature * u)) / curvature
-    normal = np.stack([-np.sin(curvature * u), 0 * u, np.cos(curvature * u)], axis=1)
+    normal = np.stack(
+        [-np.sin(curvature * u), 0 * u, np.cos(curvature * u)],
+        axis=1,
+    )
     index = np.arange(33 * 17).reshape(33, 17)
     a = index[:-1, :-1].ravel()
     b = index[1:, :-1].ravel()
     c = index[1:, 1:].ravel()
     d = index[:-1, 1:].ravel()
-    top = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    rim = np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, :0:-1]])
+    top = np.concatenate(
+        [
+            np.stack([a, b, c], axis=1),
+            np.stack([a, c, d], axis=1),
+        ]
+    )
+    rim = np.concatenate(
+        [
+            index[:-1, 0],
+            index[-1, :-1],
+            index[:0:-1, -1],
+            index[0, :0:-1],
+        ]
+    )
     following = np.roll(rim, -1)
     n = index.size
     upper = np.stack([following, rim, rim + n], axis=1)
-    lower = np.stack([following, rim + n, following + n], axis=1)
+    lower = np.stack(
+        [following, rim + n, following + n],
+        axis=1,
+    )
     sides = np.concatenate([upper, lower])
     vertices = np.concatenate([inner + 0.005 * normal, inner - 0.005 * normal])
-    return Mesh(vertices, np.concatenate([top, top[:, ::-1] + n, sides]), "sheet")
+    return Mesh(
+        vertices,
+        np.concatenate([top, top[:, ::-1] + n, sides]),
+        "sheet",
+    )
 
 
 def test_a_rolled_up_sheet_has_the_form_of_the_flat_one():
@@ -93,7 +119,13 @@ def test_points_of_space_come_back(dimension):
 
 def test_least_squares_equals_scikit_learn(sphere):
     sources = np.arange(0, 2562, 40)
-    distances = np.arccos(np.clip(sphere.vertices[sources] @ sphere.vertices[sources].T, -1, 1))
+    distances = np.arccos(
+        np.clip(
+            sphere.vertices[sources] @ sphere.vertices[sources].T,
+            -1,
+            1,
+        )
+    )
     start = classical_scaling(distances)
     form = least_squares_scaling(distances, start)
     reference, stress = smacof(
@@ -131,9 +163,17 @@ def test_moments_of_a_box_by_closed_form():
     axes = [(np.arange(40) + 0.5) / 20 - 1] * 3
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * [3, 2, 1]
     turned = points @ special_ortho_group.rvs(3, random_state=0) + 7
-    half = {0: np.ones(3), 2: np.array([9, 4, 1]) / 3, 4: np.array([81, 16, 1]) / 5}
+    half = {
+        0: np.ones(3),
+        2: np.array([9, 4, 1]) / 3,
+        4: np.array([81, 16, 1]) / 5,
+    }
     radius = np.sqrt(half[2].sum())
-    for value, (p, q, r) in zip(moments(turned, 4), exponents(4), strict=True):
+    for value, (p, q, r) in zip(
+        moments(turned, 4),
+        exponents(4),
+        strict=True,
+    ):
         odd = p % 2 or q % 2 or r % 2
         expected = 0 if odd else half[p][0] * half[q][1] * half[r][2] / radius ** (p + q + r - 1)
         assert value == pytest.approx(expected, rel=3e-3, abs=1e-9)
@@ -169,7 +209,14 @@ def test_the_form_is_that_of_least_squares(blob):
     descriptor = CanonicalForm()
     found = descriptor.describe_body(of_mesh(blob))
     # the signs of the axes are arbitrary, and rounding decides them: the distance takes the best reflection
-    fitted, plain = (distance(found.astype(float), form, descriptor) for form in forms)
+    fitted, plain = (
+        distance(
+            found.astype(float),
+            form,
+            descriptor,
+        )
+        for form in forms
+    )
     assert fitted < 1e-6 * norm(forms[0])
     assert plain > 1e-2 * norm(forms[1])
 
@@ -183,7 +230,10 @@ def test_the_numbers_of_vertices_do_not_matter(blob):
     # Simplified too, which is where ties could be broken by numbers.
     descriptor = changed(CanonicalForm(), max_vertices=400)
     order = default_rng(3).permutation(len(blob.vertices))
-    renumbered = Mesh(blob.vertices[order], np.argsort(order)[blob.faces][::-1])
+    renumbered = Mesh(
+        blob.vertices[order],
+        np.argsort(order)[blob.faces][::-1],
+    )
     expected = descriptor.describe_body(of_mesh(blob))
     found = descriptor.describe_body(of_mesh(renumbered))
     assert_allclose(found, expected, rtol=1e-4, atol=1e-6)

@@ -33,7 +33,14 @@ def test_d2_of_a_sphere_has_the_density_of_its_chords(round_body):
 
 
 def test_d2_counts_each_pair_once_and_what_lies_beyond_in_the_last_bin():
-    points = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0], [50, 0, 0]])
+    points = np.array(
+        [
+            [0.0, 0, 0],
+            [1, 0, 0],
+            [5, 0, 0],
+            [50, 0, 0],
+        ]
+    )
     histogram = changed(D2(), n_bins=4, reach=2.0).describe_body(of_points(points, area=4.0))
     # Lengths over √4: 0.5, 2.5, 25, 2, 24.5, 22.5.
     expected = [0, 1 / 6, 0, 5 / 6]

@@ -66,9 +66,18 @@ def _tube(angle):
     cap = np.linspace(0, np.pi / 2, 6)
     profile = np.concatenate(
         [
-            np.stack([0.1 * np.sin(cap), -3 - 0.1 * np.cos(cap)], axis=1),
-            np.stack([np.full(60, 0.1), np.linspace(-3, 3, 62)[1:-1]], axis=1),
-            np.stack([0.1 * np.cos(cap), 3 + 0.1 * np.sin(cap)], axis=1),
+            np.stack(
+                [0.1 * np.sin(cap), -3 - 0.1 * np.cos(cap)],
+                axis=1,
+            ),
+            np.stack(
+                [np.full(60, 0.1), np.linspace(-3, 3, 62)[1:-1]],
+                axis=1,
+            ),
+            np.stack(
+                [0.1 * np.cos(cap), 3 + 0.1 * np.sin(cap)],
+                axis=1,
+            ),
         ]
     )
     surface = trimesh.creation.revolve(profile, sections=12)
@@ -77,7 +86,10 @@ def _tube(angle):
         return as_mesh(surface)
     radius = 6 / angle
     turn = z * angle / 6
-    bent = np.stack([(radius + x) * np.cos(turn), y, (radius + x) * np.sin(turn)], axis=1)
+    bent = np.stack(
+        [(radius + x) * np.cos(turn), y, (radius + x) * np.sin(turn)],
+        axis=1,
+    )
     return Mesh(bent, surface.faces)
 
 
@@ -98,7 +110,10 @@ def test_more_samples_than_vertices_are_refused(blob):
 def test_the_numbers_of_vertices_do_not_matter(blob):
     descriptor = changed(GeodesicSpectral(), max_vertices=400)
     order = np.random.default_rng(3).permutation(len(blob.vertices))
-    renumbered = Mesh(blob.vertices[order], np.argsort(order)[blob.faces][::-1])
+    renumbered = Mesh(
+        blob.vertices[order],
+        np.argsort(order)[blob.faces][::-1],
+    )
     expected = descriptor.describe_body(of_mesh(blob))
     found = descriptor.describe_body(of_mesh(renumbered))
     assert_allclose(found, expected, rtol=1e-5)

@@ -59,7 +59,11 @@ def renumbered(mesh, seed):
     new = np.argsort(order)
     faces = generator.permutation(new[mesh.faces])
     first = generator.integers(3, size=(len(faces), 1))
-    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    faces = np.take_along_axis(
+        faces,
+        (first + np.arange(3)) % 3,
+        axis=1,
+    )
     return Mesh(mesh.vertices[order], faces, mesh.name), new
 
 
@@ -78,6 +82,9 @@ def test_rounding_does_not_decide_between_equally_far_points():
     mesh = as_mesh(octahedron.apply_scale([3.0, 2.0, 1.0]))
     expected = np.sort(farthest_points(mesh, 40).mutual, axis=None)
     for number, factor in enumerate((0.1, 1 / 3, 7.7)):
-        moved, _ = renumbered(Mesh(mesh.vertices * factor + factor, mesh.faces), number)
+        moved, _ = renumbered(
+            Mesh(mesh.vertices * factor + factor, mesh.faces),
+            number,
+        )
         found = np.sort(farthest_points(moved, 40).mutual, axis=None)
         assert_allclose(found, factor * expected, rtol=1e-9)

@@ -16,13 +16,26 @@ from own_descriptors import changed
 
 
 def body_of(points, area=1.0):
-    samples = Samples(points, np.zeros((len(points), 1), dtype=np.float32))
-    signature = Signature(np.ones(1), samples, samples, area, 1.0, SignatureConfig(n_eigenpairs=1))
+    samples = Samples(
+        points,
+        np.zeros((len(points), 1), dtype=np.float32),
+    )
+    signature = Signature(
+        np.ones(1),
+        samples,
+        samples,
+        area,
+        1.0,
+        SignatureConfig(n_eigenpairs=1),
+    )
     return of_signature(signature)
 
 
 def block(x, y, z):
-    return np.array(list(product(range(x), range(y), range(z))), dtype=float)
+    return np.array(
+        list(product(range(x), range(y), range(z))),
+        dtype=float,
+    )
 
 
 def index_of(points, point):
@@ -39,7 +52,10 @@ def links_by_looking(points):
     links = np.zeros((len(points), len(points)))
     # Steps that never land on the border between two cells.
     steps = (np.arange(100) + 0.5) / 100
-    for i, j in zip(*np.nonzero(cdist(points, points, "chebyshev") <= 2), strict=True):
+    for i, j in zip(
+        *np.nonzero(cdist(points, points, "chebyshev") <= 2),
+        strict=True,
+    ):
         p = points[i]
         q = points[j]
         offset = np.abs(q - p).astype(int)
@@ -52,7 +68,10 @@ def links_by_looking(points):
 
 
 def test_bound_is_that_of_the_98_directions():
-    steps = np.array([s for s in product(range(-2, 3), repeat=3) if gcd(*s) == 1], dtype=float)
+    steps = np.array(
+        [s for s in product(range(-2, 3), repeat=3) if gcd(*s) == 1],
+        dtype=float,
+    )
     assert len(steps) == 98
     # A path made of the steps is longest for its span where the hull of the unit steps is nearest to the origin.
     hull = ConvexHull(steps / norm(steps, axis=1, keepdims=True))
@@ -89,7 +108,12 @@ def test_path_goes_round_the_corner_of_an_l():
 
 
 def test_pieces_are_joined_at_their_closest_samples():
-    points = np.concatenate([block(3, 3, 3), block(3, 3, 3) + np.array([7, 0, 0])])
+    points = np.concatenate(
+        [
+            block(3, 3, 3),
+            block(3, 3, 3) + np.array([7, 0, 0]),
+        ]
+    )
     start = index_of(points, (0, 1, 1))
     end = index_of(points, (9, 1, 1))
     length = inner_distances(points, np.array([start]))[0, end]
@@ -98,7 +122,10 @@ def test_pieces_are_joined_at_their_closest_samples():
 
 
 def test_chain_of_single_cells_is_walked_along():
-    points = np.array([[0, 0, 0], [3, 0, 0], [7, 0, 0], [7, 5, 0], [7, 5, 1]], dtype=float)
+    points = np.array(
+        [[0, 0, 0], [3, 0, 0], [7, 0, 0], [7, 5, 0], [7, 5, 1]],
+        dtype=float,
+    )
     found = inner_distances(points, np.array([0]))[0]
     expected = [0, 3, 7, 12, 13]
     assert_allclose(found, expected)
@@ -113,7 +140,10 @@ def test_cell_is_found_where_no_two_samples_are_neighbours():
 
 @pytest.mark.parametrize(
     ("points", "message"),
-    [(np.zeros((1, 3)), "at least two"), (np.random.default_rng(0).random((30, 3)), "cubic grid")],
+    [
+        (np.zeros((1, 3)), "at least two"),
+        (np.random.default_rng(0).random((30, 3)), "cubic grid"),
+    ],
 )
 def test_samples_off_a_grid_are_refused(points, message):
     with pytest.raises(ValueError, match=message):

@@ -26,9 +26,18 @@ def tube(radius, length, sections, rings):
     """A closed cylinder about the z axis, with rounded ends."""
     heights = np.linspace(-length / 2, length / 2, rings)
     ends = radius * np.sin(np.linspace(0, np.pi / 2, 6))[1:]
-    z = np.concatenate([-length / 2 - ends[::-1], heights, length / 2 + ends])
+    z = np.concatenate(
+        [
+            -length / 2 - ends[::-1],
+            heights,
+            length / 2 + ends,
+        ]
+    )
     beyond = np.maximum(np.abs(z) - length / 2, 0)
-    profile = np.stack([np.sqrt(np.maximum(radius**2 - beyond**2, 0)), z], axis=1)
+    profile = np.stack(
+        [np.sqrt(np.maximum(radius**2 - beyond**2, 0)), z],
+        axis=1,
+    )
     profile[[0, -1], 0] = 0.0
     return as_mesh(trimesh.creation.revolve(profile, sections=sections))
 
@@ -66,7 +75,11 @@ def test_rays_that_leave_through_a_hole_do_not_count(sphere):
     # The last one faces upwards, along the rays
     faces = sphere.faces[np.argsort(height)][: (height < 0.3).sum()]
     used, index = np.unique(faces, return_inverse=True)
-    bowl = Mesh(sphere.vertices[used], index.reshape(-1, 3), allow_open=True)
+    bowl = Mesh(
+        sphere.vertices[used],
+        index.reshape(-1, 3),
+        allow_open=True,
+    )
     height = bowl.vertices[bowl.faces].mean(axis=1)[:, 2]
     diameters = local_diameters(bowl, *centres(bowl), 30, 20.0)
     assert np.isnan(diameters[height < -0.95]).all()
@@ -78,7 +91,11 @@ def test_rays_that_leave_through_a_hole_do_not_count(sphere):
 def test_surface_that_no_ray_meets_again_is_refused(sphere):
     faces = sphere.faces[sphere.vertices[sphere.faces, 2].mean(axis=1) < -0.75]
     used, index = np.unique(faces, return_inverse=True)
-    dish = Mesh(sphere.vertices[used], index.reshape(-1, 3), allow_open=True)
+    dish = Mesh(
+        sphere.vertices[used],
+        index.reshape(-1, 3),
+        allow_open=True,
+    )
     with pytest.raises(MeshError, match="no ray"):
         changed(LocalDiameterCentricity(), opening_angle=10.0).describe_body(of_mesh(dish))
 
@@ -100,11 +117,19 @@ def test_centricity_of_a_thin_tube_rises_from_a_quarter_to_half_its_length():
 def test_sources_are_a_quadrature_of_the_whole_surface(blob):
     vertices = np.array(blob.vertices)
     faces = np.array(blob.faces)
-    area = np.bincount(faces.ravel(), np.repeat(igl.doublearea(vertices, faces), 3))
+    area = np.bincount(
+        faces.ravel(),
+        np.repeat(igl.doublearea(vertices, faces), 3),
+    )
     values = centricity(blob, 60)
     everything = np.arange(len(vertices))
     for vertex in (0, 17, 333):
-        exact = igl.exact_geodesic(vertices, faces, VS=np.array([vertex]), VT=everything)
+        exact = igl.exact_geodesic(
+            vertices,
+            faces,
+            VS=np.array([vertex]),
+            VT=everything,
+        )
         expected = pytest.approx(exact @ area / area.sum(), rel=0.04)
         assert values[vertex] == expected
 
@@ -136,7 +161,10 @@ def test_triangles_count_by_their_area():
     for power in (0.5, 2.0):
         z = np.linspace(0, 1, 60) ** power * 6
         radius = np.concatenate([[0], 0.3 + 0.15 * z, [0]])
-        profile = np.stack([radius, np.concatenate([z[:1], z, z[-1:]])], axis=1)
+        profile = np.stack(
+            [radius, np.concatenate([z[:1], z, z[-1:]])],
+            axis=1,
+        )
         mesh = as_mesh(trimesh.creation.revolve(profile, sections=24))
         rows.append(descriptor.describe_body(of_mesh(mesh)).sum(axis=1))
     assert np.abs(rows[0] - rows[1]).sum() < 0.1
@@ -145,7 +173,10 @@ def test_triangles_count_by_their_area():
 def test_bending_matters_less_than_thickness():
     straight = tube(0.5, 12.0, 24, 80)
     x, y, z = straight.vertices.T
-    turned = np.stack([8 - (8 - x) * np.cos(z / 8), y, (8 - x) * np.sin(z / 8)], axis=1)
+    turned = np.stack(
+        [8 - (8 - x) * np.cos(z / 8), y, (8 - x) * np.sin(z / 8)],
+        axis=1,
+    )
     bent = Mesh(turned, straight.faces)
     thicker = tube(0.8, 12.0, 24, 80)
     descriptor = LocalDiameterCentricity()
@@ -162,5 +193,12 @@ def test_numbers_of_vertices_and_faces_do_not_matter(blob):
     faces = np.argsort(order)[blob.faces][generator.permutation(len(blob.faces))]
     descriptor = changed(LocalDiameterCentricity(), n_samples=300)
     expected = descriptor.describe_body(of_mesh(blob))
-    found = descriptor.describe_body(of_mesh(Mesh(blob.vertices[order], np.roll(faces, 1, axis=1))))
+    found = descriptor.describe_body(
+        of_mesh(
+            Mesh(
+                blob.vertices[order],
+                np.roll(faces, 1, axis=1),
+            )
+        )
+    )
     assert_allclose(found, expected, atol=1e-6)

@@ -67,7 +67,10 @@ def test_quantile_means_by_hand():
     found = quantiles([3.0, 1.0], 4)
     expected = [1, 1, 3, 3]
     assert_allclose(found, expected)
-    assert_allclose(quantiles([4.0, 1.0, 1.0], 2), [1, 3])  # 1 on [½, ⅔], 4 on [⅔, 1]
+    assert_allclose(
+        quantiles([4.0, 1.0, 1.0], 2),
+        [1, 3],
+    )  # 1 on [½, ⅔], 4 on [⅔, 1]
     found = quantiles([[5.0, 2.0]], 1)
     assert_allclose(found, [3.5])
 

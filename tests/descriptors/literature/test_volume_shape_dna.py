@@ -16,7 +16,10 @@ from own_descriptors import changed
 
 
 def cube_frequencies(n):
-    triples = sorted(product(range(1, 9), repeat=3), key=lambda t: sum(i * i for i in t))
+    triples = sorted(
+        product(range(1, 9), repeat=3),
+        key=lambda t: sum(i * i for i in t),
+    )
     return triples[:n]
 
 
@@ -39,7 +42,11 @@ def test_cube_has_the_spectrum_of_its_grid_with_all_multiplets():
     n = 12
     angles = np.pi * np.array(cube_frequencies(200)) / (2 * n)
     expected = np.sort(4 * n**2 * np.square(np.sin(angles)).sum(axis=1))[:60]
-    spectrum = volume_spectrum(as_mesh(trimesh.creation.box((1, 1, 1))), 60, n**3 - 1)
+    spectrum = volume_spectrum(
+        as_mesh(trimesh.creation.box((1, 1, 1))),
+        60,
+        n**3 - 1,
+    )
     np.testing.assert_allclose(spectrum, expected, rtol=1e-6)
 
 
@@ -58,7 +65,11 @@ def test_walls_lie_between_the_cells_where_the_surface_is():
     generator = np.random.default_rng(0)
     for _ in range(4):
         turn, _ = np.linalg.qr(generator.standard_normal((3, 3)))
-        first = volume_spectrum(Mesh(np.asarray(cube.vertices) @ turn, cube.faces), 1, 4000)
+        first = volume_spectrum(
+            Mesh(np.asarray(cube.vertices) @ turn, cube.faces),
+            1,
+            4000,
+        )
         expected = pytest.approx(3 * np.pi**2, rel=0.006)
         assert first[0] == expected
 

@@ -61,7 +61,11 @@ def test_it_is_the_share_of_samples_in_each_cell():
                     hat(direction @ aside / distance, outward),
                 ]
                 expected[k] += np.einsum("a,b,c,d->abcd", *cells)
-        assert_allclose(found[i], expected / (3 * len(points)), atol=1e-6)
+        assert_allclose(
+            found[i],
+            expected / (3 * len(points)),
+            atol=1e-6,
+        )
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -72,7 +76,12 @@ def test_neither_motion_nor_reflection_nor_scale_change_it(mirrored):
     if mirrored:
         motion = -motion
     expected = histogram(batch)
-    found = histogram(scaled(moved(batch, motion, torch.tensor([1.0, -2.0, 0.5])), 2.0))
+    found = histogram(
+        scaled(
+            moved(batch, motion, torch.tensor([1.0, -2.0, 0.5])),
+            2.0,
+        )
+    )
     assert_close(found, expected, atol=1e-4, rtol=0)
 
 
@@ -90,7 +99,10 @@ def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end(
     generator = torch.Generator().manual_seed(0)
     cube = torch.rand(20000, 3, generator=generator, dtype=torch.float64) - 0.5
     brick = cube * torch.tensor([1.0, 3.0, 2.0])
-    far = torch.tensor([[0.0, -4.0, 0.0]], dtype=torch.float64)
+    far = torch.tensor(
+        [[0.0, -4.0, 0.0]],
+        dtype=torch.float64,
+    )
     turn = torch.from_numpy(Rotation.from_euler("xyz", (0.3, 0.5, -0.2)).as_matrix())
     points = torch.cat([brick, far.expand(50, 3)]) @ turn.T + 7
     weights = torch.ones(len(points), dtype=torch.float64)
@@ -144,4 +156,9 @@ def test_needs_and_errors():
     points = batch.surface.points.clone()
     points[0, 0, 0] = torch.nan
     with pytest.raises(ValueError, match="AxialHistogram: expected finite values"):
-        AxialHistogram(EMBEDDING)(replace(batch, surface=replace(batch.surface, points=points)))
+        AxialHistogram(EMBEDDING)(
+            replace(
+                batch,
+                surface=replace(batch.surface, points=points),
+            )
+        )

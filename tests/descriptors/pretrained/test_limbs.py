@@ -86,7 +86,10 @@ def test_pieces_count_by_their_sizes_and_lengths():
         order = np.argsort(-np.linalg.norm(coordinates, axis=1)).tolist()
         expected = np.zeros((3, 4, 3))
         for level, share in enumerate(LEVELS):
-            for piece in pieces_of(set(order[: round(share * len(order))]), graph):
+            for piece in pieces_of(
+                set(order[: round(share * len(order))]),
+                graph,
+            ):
                 size = len(piece) / len(order)
                 places = points[sorted(piece)]
                 length = 2.0**-9
@@ -104,10 +107,16 @@ def star(n_arms, length, seed):
     generator = torch.Generator().manual_seed(seed)
     along = torch.linspace(0, length, 60).exp()
     arms = (torch.eye(n_arms)[:, None] * along[:, None]).flatten(0, 1)
-    middle = torch.nn.functional.normalize(torch.rand(200, n_arms, generator=generator), dim=1)
+    middle = torch.nn.functional.normalize(
+        torch.rand(200, n_arms, generator=generator),
+        dim=1,
+    )
     points = torch.cat([arms, 0.999 * middle])
     noise = 1e-4 * torch.rand(points.shape, generator=generator)
-    return batch_of((points + noise)[None], points=points[None, :, :3].contiguous())
+    return batch_of(
+        (points + noise)[None],
+        points=points[None, :, :3].contiguous(),
+    )
 
 
 def test_as_many_shares_are_large_as_there_are_arms():
@@ -118,9 +127,18 @@ def test_as_many_shares_are_large_as_there_are_arms():
 
 def test_pieces_of_a_star_are_its_arms():
     """Each of three arms has 60 of 380 points: the binary log is −2.66, between the last two centres."""
-    histogram = PieceHistogram((180 / 380,), SpectralEmbedding(), n_bins=(6, 5))
+    histogram = PieceHistogram(
+        (180 / 380,),
+        SpectralEmbedding(),
+        n_bins=(6, 5),
+    )
     found = histogram(star(3, 1.0, seed=3))[0, 0]
-    of_sizes = np.array(hat(float(np.log2(60 / 380)), np.linspace(-6, -0.5, 6).tolist()))
+    of_sizes = np.array(
+        hat(
+            float(np.log2(60 / 380)),
+            np.linspace(-6, -0.5, 6).tolist(),
+        )
+    )
     assert_allclose(found.sum(dim=1), of_sizes, atol=0.02)
     assert float(found[:, 3:].sum()) > 0.9  # rods
 
@@ -135,14 +153,22 @@ def test_padding_and_scale_change_nothing(make):
     assert_close(found.flatten(1).sum(dim=1), expected)
     for i in range(2):
         assert_close(histogram(alone(batch, i))[0], found[i])
-    assert_close(histogram(scaled(batch, 3.0)), found, atol=1e-5, rtol=0)
+    assert_close(
+        histogram(scaled(batch, 3.0)),
+        found,
+        atol=1e-5,
+        rtol=0,
+    )
 
 
 @BOTH
 def test_the_order_of_samples_changes_nothing(make):
     batch = alone(two_bodies(), 0)
     histogram = make(embedding=EMBEDDING)
-    order = torch.randperm(40, generator=torch.Generator().manual_seed(5))
+    order = torch.randperm(
+        40,
+        generator=torch.Generator().manual_seed(5),
+    )
     surface = batch.surface
     other = surface.map(lambda values: values[:, order])
     found = histogram(replace(batch, surface=other))
@@ -152,7 +178,12 @@ def test_the_order_of_samples_changes_nothing(make):
 @BOTH
 def test_a_subset_of_the_samples_is_told(make):
     batch = two_bodies()
-    expected = make(embedding=EMBEDDING)(replace(batch, surface=batch.surface.subset(20, seed=0)))
+    expected = make(embedding=EMBEDDING)(
+        replace(
+            batch,
+            surface=batch.surface.subset(20, seed=0),
+        )
+    )
     found = make(embedding=EMBEDDING, n_samples=20)(batch)
     assert_close(found, expected)
     interior = make(embedding=EMBEDDING, samples="interior")(batch)
@@ -162,7 +193,10 @@ def test_a_subset_of_the_samples_is_told(make):
 
 @BOTH
 def test_a_body_that_is_the_same_everywhere_is_one_piece(make):
-    same = batch_of(torch.ones(1, 10, 3), points=torch.ones(1, 10, 3))
+    same = batch_of(
+        torch.ones(1, 10, 3),
+        points=torch.ones(1, 10, 3),
+    )
     found = make()(same)
     assert_close(found.sum(), torch.tensor(1.0))
     assert torch.isfinite(found).all()
@@ -176,7 +210,10 @@ def test_needs_and_what_is_refused(make):
     with pytest.raises(ValueError, match="n_samples: expected at least 2, got 1"):
         make(n_samples=1)
     batch = two_bodies()
-    none = replace(batch.surface, mask=torch.zeros_like(batch.surface.mask))
+    none = replace(
+        batch.surface,
+        mask=torch.zeros_like(batch.surface.mask),
+    )
     with pytest.raises(ValueError, match="samples: expected at least one of each body, got none"):
         make(embedding=EMBEDDING)(replace(batch, surface=none))
     missing = torch.full_like(batch.surface.eigenfunctions, torch.nan)
@@ -196,15 +233,30 @@ def test_layouts_that_are_none_are_named():
     with pytest.raises(ValueError, match="n_bins: expected two numbers, each at least 2"):
         PieceHistogram(n_bins=(1, 5))
     batch = two_bodies()
-    broken = replace(batch.surface, points=torch.full_like(batch.surface.points, torch.inf))
+    broken = replace(
+        batch.surface,
+        points=torch.full_like(batch.surface.points, torch.inf),
+    )
     with pytest.raises(ValueError, match="PieceHistogram: expected finite positions"):
         PieceHistogram(embedding=EMBEDDING)(replace(batch, surface=broken))
 
 
 def test_gradients_are_those_of_differences():
     generator = torch.Generator().manual_seed(7)
-    embedding = torch.randn(1, 12, 3, generator=generator, dtype=torch.float64)
-    points = torch.rand(1, 12, 3, generator=generator, dtype=torch.float64)
+    embedding = torch.randn(
+        1,
+        12,
+        3,
+        generator=generator,
+        dtype=torch.float64,
+    )
+    points = torch.rand(
+        1,
+        12,
+        3,
+        generator=generator,
+        dtype=torch.float64,
+    )
 
     def branches(values):
         return BranchHistogram(SpectralEmbedding(), n_branches=3).double()(batch_of(values))

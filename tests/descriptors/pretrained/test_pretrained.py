@@ -63,20 +63,38 @@ def test_rich_is_its_histograms_side_by_side_with_equal_shares(dataset, histogra
     with torch.inference_mode():
         for part in found.parts:
             expected += [histogram(batch).flatten(1) / (3 * len(part)) for histogram in part]
-    assert_close(histograms[[0, 7]], torch.cat(expected, dim=1), rtol=1e-4, atol=1e-7)
+    assert_close(
+        histograms[[0, 7]],
+        torch.cat(expected, dim=1),
+        rtol=1e-4,
+        atol=1e-7,
+    )
     for part in histograms.split(CELLS, dim=1):
-        assert_close(part.sum(dim=1), torch.full((len(part),), 1 / 3), rtol=1e-4, atol=0)
+        assert_close(
+            part.sum(dim=1),
+            torch.full((len(part),), 1 / 3),
+            rtol=1e-4,
+            atol=0,
+        )
     # The distance of the whole is then the mean of those of the parts, each a histogram of sum 1.
     of_parts = [chi_square(3 * part, 3 * part) for part in histograms.split(CELLS, dim=1)]
     whole = found.distances(histograms, histograms)
-    assert_close(whole, torch.stack(of_parts).mean(dim=0), rtol=1e-4, atol=1e-6)
+    assert_close(
+        whole,
+        torch.stack(of_parts).mean(dim=0),
+        rtol=1e-4,
+        atol=1e-6,
+    )
 
 
 def test_a_class_is_closer_to_itself(dataset, histograms):
     """NN and FT of `rich`; as a control, FT of shuffled labels, where 2 of 35 other shapes (6 %) match."""
     distances = igps.descriptor("rich").distances(histograms, histograms)
     scores = retrieval_scores(distances, dataset.labels).mean()
-    order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(
+        len(dataset),
+        generator=torch.Generator().manual_seed(0),
+    )
     shuffled = dataset.labels[order]
     by_chance = retrieval_scores(chi_square(histograms, histograms), shuffled).mean()
     assert scores["nn"] > 0.9
@@ -96,7 +114,10 @@ def test_pretrained_is_what_its_parameters_say(dataset):
         of_level = {key.rsplit(".", 1)[1]: stored[key] for key in keys}
         assert of_level["part_cells"].long().tolist() == list(PART_CELLS)
         sizes = [PART_CELLS[i] for i in parts]
-        seen = torch.cat([roots.split(PART_CELLS, dim=1)[i] for i in parts], dim=1)
+        seen = torch.cat(
+            [roots.split(PART_CELLS, dim=1)[i] for i in parts],
+            dim=1,
+        )
         centred = (seen - of_level["mean"]).split(sizes, dim=1)
         directions = of_level["directions"].split(sizes, dim=1)
         projected = [a @ b[: a.shape[1]].T for a, b in zip(centred, directions, strict=True)]
@@ -104,27 +125,44 @@ def test_pretrained_is_what_its_parameters_say(dataset):
             vectors = torch.cat(projected, dim=1)
             last = (1 - vectors.square().sum(dim=1, keepdim=True)).sqrt()
             return torch.cat([vectors, last], dim=1)
-        return normalize(torch.cat([normalize(one) for one in projected], dim=1))
+        return normalize(
+            torch.cat(
+                [normalize(one) for one in projected],
+                dim=1,
+            )
+        )
 
     classes = level("class_head", CLASS_PARTS)
     bodies = [level(f"body_heads.{k}", (part,)) for k, part in enumerate(BODY_PARTS)]
     share, scales, exponents = (stored[f"head.{name}"] for name in ("share", "scales", "exponents"))
     found = describe(part, module)
     of_bodies = [(share / 2).sqrt() * one for one in bodies]
-    expected = torch.cat([(1 - share).sqrt() * classes, *of_bodies], dim=1)
+    expected = torch.cat(
+        [(1 - share).sqrt() * classes, *of_bodies],
+        dim=1,
+    )
     assert_close(found.double(), expected, atol=1e-4, rtol=0)
     from_mean = torch.stack([one[:, :-1].square().sum(dim=1) for one in bodies]).mean(dim=0).sqrt()
     shorter = (torch.outer(from_mean, from_mean).sqrt() / (0.5 / 2**0.5)).sqrt()
     exponent = torch.zeros(4, 4, dtype=torch.float64)
     between = torch.ones(4, 4, dtype=torch.float64)
     for one, scale, power in zip(bodies, scales, exponents, strict=True):
-        apart = torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist")
+        apart = torch.cdist(
+            one[:, :-1],
+            one[:, :-1],
+            compute_mode="donot_use_mm_for_euclid_dist",
+        )
         exponent += (apart * shorter / scale) ** 20
         between *= apart**power
     differ = (1 - torch.exp(-exponent)) * (1 - torch.exp(-((between / 0.1) ** 20)))
     distances = 0.95 * (1 - classes @ classes.T) * differ
     distances += 0.05 * (1 - torch.exp(-((between / 0.1) ** 2)))
-    assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
+    assert_close(
+        module.distances(found, found).double(),
+        distances,
+        atol=2e-3,
+        rtol=0,
+    )
 
 
 def test_pretrained_gives_unit_vectors_and_short_ones(dataset):
@@ -136,7 +174,12 @@ def test_pretrained_gives_unit_vectors_and_short_ones(dataset):
     assert short.shape == (len(dataset), 256)
     for vectors in (found, short):
         expected = torch.ones(len(dataset))
-        assert_close(vectors.norm(dim=1), expected, atol=1e-5, rtol=0)
+        assert_close(
+            vectors.norm(dim=1),
+            expected,
+            atol=1e-5,
+            rtol=0,
+        )
     whole, of_short = (
         retrieval_scores(cosine(one, one), dataset.labels).mean()["ft"] for one in (found, short)
     )
@@ -187,7 +230,11 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_nu
     batch = dataset.batch([0]).to(torch.float64)
     pretrained = igps.descriptor("pretrained").double()
     surface = batch.surface.subset(200, 0)
-    batch = replace(batch, interior=batch.interior.subset(200, 0), surface=surface)
+    batch = replace(
+        batch,
+        interior=batch.interior.subset(200, 0),
+        surface=surface,
+    )
     generator = torch.Generator().manual_seed(2)
     places = batch.surface.points
     along = torch.randn(1, 200, 3, generator=generator).double()
@@ -199,7 +246,12 @@ def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_nu
 
     leaf = places.clone().requires_grad_()
     expected = (torch.autograd.grad(loss(leaf), leaf)[0] * along).sum()
-    assert_close(torch.func.jvp(loss, (places,), (along,))[1], expected, rtol=1e-6, atol=0)
+    assert_close(
+        torch.func.jvp(loss, (places,), (along,))[1],
+        expected,
+        rtol=1e-6,
+        atol=0,
+    )
     assert torch.isfinite(torch.func.jvp(torch.func.grad(loss), (places,), (along,))[1]).all()
 
 
@@ -222,8 +274,20 @@ def test_coordinates_within_a_class_separate_a_small_difference_from_sampling():
 
     def described(width, seed):
         bend = [0.3, 0, 0] * ball.vertices[:, 2:] ** 2
-        body = Mesh(ball.vertices * [0.8 * width, 0.6, 1.6] + bend, ball.faces)
-        return descriptor(collate([compute_signature(body, replace(config, seed=seed))]))
+        body = Mesh(
+            ball.vertices * [0.8 * width, 0.6, 1.6] + bend,
+            ball.faces,
+        )
+        return descriptor(
+            collate(
+                [
+                    compute_signature(
+                        body,
+                        replace(config, seed=seed),
+                    )
+                ]
+            )
+        )
 
     descriptions = torch.cat([described(width, seed) for width in (1.0, 1.03) for seed in range(3)])
     coordinates = descriptor.coordinates(descriptions, within_class=True)

@@ -32,7 +32,12 @@ def test_a_spectrum_that_follows_weyl_has_equal_shares():
     line = 4 * torch.pi * torch.arange(1, 13, dtype=torch.float64) / batch.area[:, None]
     found = SpectrumShares(12)(replace(batch, eigenvalues=line))
     own = 4 * torch.pi * (3 * batch.volume / (4 * torch.pi)) ** (2 / 3) / batch.area
-    assert_close(found[:, :12].double(), (own / 24)[:, None].expand(2, 12), atol=1e-7, rtol=0)
+    assert_close(
+        found[:, :12].double(),
+        (own / 24)[:, None].expand(2, 12),
+        atol=1e-7,
+        rtol=0,
+    )
 
 
 def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off():
@@ -40,8 +45,16 @@ def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off():
     part = SpectrumShares(min(N_EIGENPAIRS))
     found = part(replace(batch, eigenvalues=1e3 * batch.eigenvalues))
     expected = part(batch)[:, :-1]
-    assert_close(found[:, :-1], expected / expected.sum(dim=1, keepdim=True))
-    assert_close(found[:, -1], torch.zeros(2), atol=1e-6, rtol=0)
+    assert_close(
+        found[:, :-1],
+        expected / expected.sum(dim=1, keepdim=True),
+    )
+    assert_close(
+        found[:, -1],
+        torch.zeros(2),
+        atol=1e-6,
+        rtol=0,
+    )
 
 
 def test_padding_and_scale_change_nothing():

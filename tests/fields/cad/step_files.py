@@ -38,7 +38,12 @@ def write_step(path, parts, unit=".MILLI."):
         design = add(f"PRODUCT_DEFINITION_CONTEXT('part definition',{application},'design')")
         definition = add(f"PRODUCT_DEFINITION('design','',{formation},{design})")
         shape = add(f"PRODUCT_DEFINITION_SHAPE('','',{definition})")
-        origin = _placement(add, (0, 0, 0), (0, 0, 1), (1, 0, 0))
+        origin = _placement(
+            add,
+            (0, 0, 0),
+            (0, 0, 1),
+            (1, 0, 0),
+        )
         solids = ",".join(_box(add, low, high) for low, high in boxes)
         form = add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('',({origin},{solids}),{context})")
         add(f"SHAPE_DEFINITION_REPRESENTATION({shape},{form})")
@@ -70,7 +75,10 @@ def _box(add, low, high):
     for bits, axis in itertools.product(corners, range(3)):
         if not bits[axis]:
             other = tuple(1 if i == axis else bit for i, bit in enumerate(bits))
-            way = _direction(add, tuple(float(i == axis) for i in range(3)))
+            way = _direction(
+                add,
+                tuple(float(i == axis) for i in range(3)),
+            )
             vector = add(f"VECTOR('',{way},1.)")
             line = add(f"LINE('',{_point(add, corners[bits])},{vector})")
             edges[bits, other] = add(

@@ -72,12 +72,24 @@ def test_off_with_its_word_in_any_case_or_without(word, tmp_path):
 def polygons():
     """The box as ten triangles and a quadrilateral."""
     faces = [list(map(int, face)) for face in BOX.faces]
-    beside = next(k for k in range(1, 12) if np.allclose(BOX.face_normals[k], BOX.face_normals[0]))
+    beside = next(
+        k
+        for k in range(1, 12)
+        if np.allclose(
+            BOX.face_normals[k],
+            BOX.face_normals[0],
+        )
+    )
     first = faces[0]
     second = faces[beside]
     opposite = next(corner for corner in second if corner not in first)
     at = next(k for k in range(3) if first[k] not in second)
-    quad = [first[at], first[(at + 1) % 3], opposite, first[(at + 2) % 3]]
+    quad = [
+        first[at],
+        first[(at + 1) % 3],
+        opposite,
+        first[(at + 2) % 3],
+    ]
     others = [face for k, face in enumerate(faces) if k not in (0, beside)]
     return [quad, *others]
 
@@ -108,7 +120,10 @@ def ply(order, lists_first):
     return "\n".join(header).encode() + body
 
 
-@pytest.mark.parametrize(("order", "lists_first"), [("", True), ("<", False), (">", True)])
+@pytest.mark.parametrize(
+    ("order", "lists_first"),
+    [("", True), ("<", False), (">", True)],
+)
 def test_ply_with_lists_of_texture_coordinates(order, lists_first, tmp_path):
     (tmp_path / "box.ply").write_bytes(ply(order, lists_first))
     mesh = load_mesh(tmp_path / "box.ply")
@@ -268,8 +283,15 @@ def test_an_object_of_gltf_is_a_node_with_all_its_materials(tmp_path):
 
 
 def test_two_nodes_of_one_mesh_are_two_objects(tmp_path):
-    nodes = [{"mesh": 0, "name": "part"}, {"mesh": 0, "name": "part", "translation": [9, 0, 0]}]
-    path = glb(tmp_path / "boxes.glb", nodes=nodes, scenes=[{"nodes": [0, 1]}])
+    nodes = [
+        {"mesh": 0, "name": "part"},
+        {"mesh": 0, "name": "part", "translation": [9, 0, 0]},
+    ]
+    path = glb(
+        tmp_path / "boxes.glb",
+        nodes=nodes,
+        scenes=[{"nodes": [0, 1]}],
+    )
     bodies = list(each_body(path, LoadOptions(bodies="objects")))
     names = sorted(str(ref.part) for ref, _ in bodies)
     assert len(set(names)) == 2
@@ -373,7 +395,11 @@ def test_many_vertices_without_coordinates_are_refused(tmp_path):
 
 def test_an_open_box_is_called_open(tmp_path):
     is_bottom = BOX.triangles_center[:, 2] < -1.99
-    box = trimesh.Trimesh(BOX.vertices, BOX.faces[~is_bottom], process=False)
+    box = trimesh.Trimesh(
+        BOX.vertices,
+        BOX.faces[~is_bottom],
+        process=False,
+    )
     box.export(tmp_path / "box.off")
     mesh = load_mesh(tmp_path / "box.off")
     (note,) = [note for note in mesh.notes if note.startswith("open: ")]
@@ -422,9 +448,18 @@ def test_nrrd_without_spacing_claims_no_unit(extra, tmp_path):
 
 
 def test_two_geometries_of_nifti_that_differ_are_both_named(tmp_path):
-    image = nibabel.Nifti1Image(block(), np.diag([3.0, 3.0, 3.0, 1.0]))
-    image.set_qform(np.diag([6.0, 6.0, 6.0, 1.0]), 1)
-    image.set_sform(np.diag([3.0, 3.0, 3.0, 1.0]), 1)
+    image = nibabel.Nifti1Image(
+        block(),
+        np.diag([3.0, 3.0, 3.0, 1.0]),
+    )
+    image.set_qform(
+        np.diag([6.0, 6.0, 6.0, 1.0]),
+        1,
+    )
+    image.set_sform(
+        np.diag([3.0, 3.0, 3.0, 1.0]),
+        1,
+    )
     image.to_filename(tmp_path / "block.nii.gz")
     mesh = load_mesh(tmp_path / "block.nii.gz")
     assert mesh.volume == pytest.approx(64 * 27, rel=0.01)
@@ -447,7 +482,11 @@ def test_a_tiff_that_is_cut_short_is_refused(ome, share, tmp_path):
     sides = {f"PhysicalSize{axis}": 0.5 for axis in "XYZ"}
     imagej = {"axes": "ZYX", "spacing": 0.5, "unit": "um"}
     metadata = {"axes": "ZYX", **sides} if ome else imagej
-    labels = np.repeat(np.repeat(block(), 4, axis=1), 4, axis=2)
+    labels = np.repeat(
+        np.repeat(block(), 4, axis=1),
+        4,
+        axis=2,
+    )
     path = tmp_path / "block.tif"
     tifffile.imwrite(path, labels, ome=ome, imagej=not ome, metadata=metadata)
     whole = load_mesh(path)
@@ -468,7 +507,11 @@ def test_a_tiff_that_is_cut_short_is_refused(ome, share, tmp_path):
 
 def test_surfaces_of_freesurfer_under_any_ending(tmp_path):
     for name in ("lh.pial.T1", "rh.white.preaparc", "lh.midthickness"):
-        nibabel.freesurfer.write_geometry(str(tmp_path / name), BOX.vertices, BOX.faces)
+        nibabel.freesurfer.write_geometry(
+            str(tmp_path / name),
+            BOX.vertices,
+            BOX.faces,
+        )
         mesh = load_mesh(tmp_path / name)
         assert mesh.volume == pytest.approx(VOLUME)
         assert mesh.unit == "mm"

@@ -82,7 +82,12 @@ def vtp(form):
     arrays = {
         "points": VERTICES.astype("<f4"),
         "connectivity": FACES.ravel().astype("<i8"),
-        "offsets": np.arange(3, 3 * len(FACES) + 1, 3, dtype="<i8"),
+        "offsets": np.arange(
+            3,
+            3 * len(FACES) + 1,
+            3,
+            dtype="<i8",
+        ),
     }
     kinds = {"points": "Float32", "connectivity": "Int64", "offsets": "Int64"}
     appended = b""
@@ -108,7 +113,10 @@ def gifti(path, encoding):
     array = nibabel.gifti.GiftiDataArray
     points = array(VERTICES.astype("f4"), "NIFTI_INTENT_POINTSET", encoding=encoding)
     triangles = array(FACES.astype("i4"), "NIFTI_INTENT_TRIANGLE", encoding=encoding)
-    nibabel.save(nibabel.gifti.GiftiImage(darrays=[points, triangles]), path)
+    nibabel.save(
+        nibabel.gifti.GiftiImage(darrays=[points, triangles]),
+        path,
+    )
 
 
 def zipped(path):
@@ -228,14 +236,29 @@ def test_corners_in_one_place_are_one_vertex_in_the_order_in_which_they_come():
 
 def test_volumes_of_cells_give_the_surface_around_them(tmp_path):
     """Two cells of every kind side by side: the wall between them is inside, and the volume is that of both."""
-    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    square = np.array(
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]],
+        dtype=float,
+    )
     cube = np.vstack([square, square + np.array([0, 0, 1])])
     twice = np.vstack([cube, square + np.array([0, 0, 2])])
-    hexahedra = meshio.Mesh(twice, [("hexahedron", [[*range(8)], [*range(4, 12)]])])
-    wedges = meshio.Mesh(cube, [("wedge", [[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]])])
+    hexahedra = meshio.Mesh(
+        twice,
+        [("hexahedron", [[*range(8)], [*range(4, 12)]])],
+    )
+    wedges = meshio.Mesh(
+        cube,
+        [("wedge", [[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]])],
+    )
     tips = np.vstack([square, [[0.5, 0.5, 1], [0.5, 0.5, -1]]])
-    pyramids = meshio.Mesh(tips, [("pyramid", [[0, 1, 2, 3, 4], [0, 3, 2, 1, 5]])])
-    tetrahedra = meshio.Mesh(tips, [("tetra", [[0, 1, 2, 4], [0, 2, 3, 4]])])
+    pyramids = meshio.Mesh(
+        tips,
+        [("pyramid", [[0, 1, 2, 3, 4], [0, 3, 2, 1, 5]])],
+    )
+    tetrahedra = meshio.Mesh(
+        tips,
+        [("tetra", [[0, 1, 2, 4], [0, 2, 3, 4]])],
+    )
     for cells, n_faces, volume in (
         (hexahedra, 20, 2),
         (wedges, 12, 1),
@@ -269,7 +292,10 @@ def test_strips_and_polygons_of_vtk_files(tmp_path):
     (tmp_path / "strip.vtk").write_text(head + corners + "TRIANGLE_STRIPS 1 7\n6 0 1 2 3 0 1\n")
     assert load_mesh(tmp_path / "strip.vtk").volume == pytest.approx(1 / 6)
     angle = 2 * np.pi * np.arange(5) / 5
-    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(5)], axis=1)
+    ring = np.stack(
+        [np.cos(angle), np.sin(angle), np.zeros(5)],
+        axis=1,
+    )
     sides = [[i, (i + 1) % 5, (i + 1) % 5 + 5, i + 5] for i in range(5)]
     polygons = [[4, 3, 2, 1, 0], [5, 6, 7, 8, 9], *sides]
     cells = "".join(" ".join(map(str, [len(row), *row])) + "\n" for row in polygons)
@@ -299,7 +325,11 @@ FAULTY = {
         "STRUCTURED_POINTS",
     ),
     "cut.vtp": (
-        vtp("raw").replace(np.uint32(12 * len(VERTICES)).tobytes(), b"\xff\xff\xff\x7f", 1),
+        vtp("raw").replace(
+            np.uint32(12 * len(VERTICES)).tobytes(),
+            b"\xff\xff\xff\x7f",
+            1,
+        ),
         "bytes, got",
     ),
     "lz4.vtu": (b'<VTKFile compressor="vtkLZ4DataCompressor"/>', "vtkLZ4DataCompressor"),
@@ -344,7 +374,13 @@ def test_one_long_number_does_not_widen_all_others(name, tmp_path):
     WRITERS[name](tmp_path / name)
     content = (tmp_path / name).read_bytes()
     word = re.findall(rb"\d\.\d{6,}", content)[5]  # those before may be of a normal
-    (tmp_path / name).write_bytes(content.replace(word, word + b"0" * 30_000, 1))
+    (tmp_path / name).write_bytes(
+        content.replace(
+            word,
+            word + b"0" * 30_000,
+            1,
+        )
+    )
     tracemalloc.start()
     mesh = load_mesh(tmp_path / name)
     peak = tracemalloc.get_traced_memory()[1]
@@ -376,10 +412,22 @@ def test_an_array_that_promises_too_much_is_not_unpacked(tmp_path):
 
 def bracket():
     """A prism over a C of area 10 and perimeter 22: octagons whose first corner sees not all others, and squares."""
-    outline = np.array([[4, 0], [4, 1], [1, 1], [1, 3], [4, 3], [4, 4], [0, 4], [0, 0]], float)
-    vertices = np.concatenate([np.c_[outline, np.zeros(8)], np.c_[outline, np.ones(8)]])
+    outline = np.array(
+        [[4, 0], [4, 1], [1, 1], [1, 3], [4, 3], [4, 4], [0, 4], [0, 0]],
+        float,
+    )
+    vertices = np.concatenate(
+        [
+            np.c_[outline, np.zeros(8)],
+            np.c_[outline, np.ones(8)],
+        ]
+    )
     sides = [[i, (i + 1) % 8, 8 + (i + 1) % 8, 8 + i] for i in range(8)]
-    return vertices, [[*range(7, -1, -1)], [*range(8, 16)], *sides]
+    return vertices, [
+        [*range(7, -1, -1)],
+        [*range(8, 16)],
+        *sides,
+    ]
 
 
 def text_of(rows, counted=True):
@@ -410,7 +458,12 @@ def polygon_files():
     vertices, faces = bracket()
     places = "".join(" ".join(map(str, row)) + "\n" for row in vertices.tolist())
     size = sum(len(row) + 1 for row in faces)
-    offsets = " ".join(map(str, np.cumsum([len(row) for row in faces])))
+    offsets = " ".join(
+        map(
+            str,
+            np.cumsum([len(row) for row in faces]),
+        )
+    )
     arrays = (
         f'<Points><DataArray type="Float64" NumberOfComponents="3" format="ascii">{places}</DataArray></Points><Polys>'
         f'<DataArray type="Int64" Name="connectivity" format="ascii">{text_of(faces, False)}</DataArray>'
@@ -443,8 +496,18 @@ def test_concave_polygons_of_any_format_do_not_fold(name, tmp_path):
 
 
 def test_squares_are_what_trimesh_makes_of_them(tmp_path):
-    faces = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
-    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    faces = [
+        [0, 3, 2, 1],
+        [4, 5, 6, 7],
+        [0, 1, 5, 4],
+        [1, 2, 6, 5],
+        [2, 3, 7, 6],
+        [3, 0, 4, 7],
+    ]
+    square = np.array(
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]],
+        float,
+    )
     vertices = np.concatenate([square, square + np.array([0, 0, 1])])
     (tmp_path / "one.off").write_text(f"OFF\n8 6 0\n{lines(vertices)}{text_of(faces)}")
     for name, order in (("text", ""), ("little", "<"), ("big", ">")):

@@ -64,7 +64,12 @@ def test_a_size_that_lies_does_not_help(tmp_path):
     """The sizes that a ZIP declares are made small; no more than them is unpacked."""
     content = zip_of({"a.off": BOMB})
     declared = len(BOMB).to_bytes(4, "little")
-    (tmp_path / "a.zip").write_bytes(content.replace(declared, (100).to_bytes(4, "little")))
+    (tmp_path / "a.zip").write_bytes(
+        content.replace(
+            declared,
+            (100).to_bytes(4, "little"),
+        )
+    )
     with pytest.raises(MeshError, match=r"a\.zip: not readable"):
         load_mesh(tmp_path / "a.zip", LoadOptions(max_unpacked=LIMIT))
 
@@ -135,15 +140,26 @@ def gltf(uri):
 
 @pytest.mark.parametrize("suffix", ["gltf", "glb"])
 @pytest.mark.parametrize(
-    "how", [{"normalized": True}, {"sparse": {"count": 1, "indices": {}, "values": {}}}, {}]
+    "how",
+    [
+        {"normalized": True},
+        {"sparse": {"count": 1, "indices": {}, "values": {}}},
+        {},
+    ],
 )
 def test_coordinates_that_would_be_taken_for_others_are_refused(how, suffix, tmp_path):
     """Of a scene whose places are whole numbers, as tools that compress make them."""
     scene = json.loads(gltf("numbers.bin"))
     scene["accessors"][0] |= {"componentType": 5122, **how}
     scene["bufferViews"][0]["byteStride"] = 8
-    rows = np.array([[0, 0, 0, 0], [9, 0, 0, 0], [0, 9, 0, 0], [0, 0, 9, 0]], dtype="<i2")
-    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype="<u4")
+    rows = np.array(
+        [[0, 0, 0, 0], [9, 0, 0, 0], [0, 9, 0, 0], [0, 0, 9, 0]],
+        dtype="<i2",
+    )
+    faces = np.array(
+        [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]],
+        dtype="<u4",
+    )
     numbers = rows.tobytes().ljust(48, b"\0") + faces.tobytes()
     (tmp_path / "numbers.bin").write_bytes(numbers)
     if suffix == "glb":
@@ -189,8 +205,14 @@ def test_a_scene_that_is_packed_otherwise_is_told(changed, told, tmp_path, monke
 
 
 def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path):
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype="<f4")
-    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype="<u4")
+    vertices = np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        dtype="<f4",
+    )
+    faces = np.array(
+        [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]],
+        dtype="<u4",
+    )
     folder = tmp_path / "folder"
     folder.mkdir()
     for place in (folder, tmp_path):

@@ -13,7 +13,16 @@ def molecule(positions, radii):
     radii = np.atleast_1d(np.asarray(radii, dtype=float))
     n = len(radii)
     none = np.zeros(n)
-    return Molecule("balls", positions, radii, none, np.arange(n), ("X",) * n, positions, none)
+    return Molecule(
+        "balls",
+        positions,
+        radii,
+        none,
+        np.arange(n),
+        ("X",) * n,
+        positions,
+        none,
+    )
 
 
 def ball(r):

@@ -22,7 +22,10 @@ PACKED = {"kind": "IntegerPacking", "byteCount": 1, "isUnsigned": False}
 
 def packed(values, *encoding):
     dtype = {1: "i1", 3: "<i4"}[encoding[-1]["type"]]
-    return {"data": np.array(values, dtype).tobytes(), "encoding": list(encoding)}
+    return {
+        "data": np.array(values, dtype).tobytes(),
+        "encoding": list(encoding),
+    }
 
 
 def strings(values):
@@ -54,9 +57,30 @@ def file_of(n_rows, *columns, name="_atom_site"):
     [
         (packed([1, 2, -3, 127, 1], PACKED, INT8), [1, 2, -3, 128]),
         (packed([1, -128, -2, 127, 0], PACKED, INT8), [1, -130, 127]),
-        (packed([0, 3, 2, 1], {"kind": "Delta", "origin": 1000}, INT8), [1000, 1003, 1005, 1006]),
-        (packed([1, 3, 2, 1, 3, 2], {"kind": "RunLength"}, INT32), [1, 1, 1, 2, 3, 3]),
-        (packed([120, 123, 12], {"kind": "FixedPoint", "factor": 100}, INT32), [1.2, 1.23, 0.12]),
+        (
+            packed(
+                [0, 3, 2, 1],
+                {"kind": "Delta", "origin": 1000},
+                INT8,
+            ),
+            [1000, 1003, 1005, 1006],
+        ),
+        (
+            packed(
+                [1, 3, 2, 1, 3, 2],
+                {"kind": "RunLength"},
+                INT32,
+            ),
+            [1, 1, 1, 2, 3, 3],
+        ),
+        (
+            packed(
+                [120, 123, 12],
+                {"kind": "FixedPoint", "factor": 100},
+                INT32,
+            ),
+            [1.2, 1.23, 0.12],
+        ),
         (
             packed(
                 [0, 0, 1, 2, 2, 1],
@@ -110,7 +134,10 @@ def packed_column(name, values):
         n_limits, rest = divmod(abs(step), abs(limit))
         small += [limit] * n_limits + [rest if step >= 0 else -rest]
     point = {"kind": "FixedPoint", "factor": 1000}
-    return column(name, packed(small, point, {"kind": "Delta", "origin": 0}, PACKED, INT8))
+    return column(
+        name,
+        packed(small, point, {"kind": "Delta", "origin": 0}, PACKED, INT8),
+    )
 
 
 @pytest.mark.parametrize("suffix", [".bcif", ".BCIF.gz"])
@@ -126,7 +153,13 @@ def test_it_is_the_molecule_of_the_same_mmcif(suffix, tmp_path):
         for tag, *values in zip(table.tags, *table, strict=True):
             plain_values = [gemmi.cif.as_string(value) or value for value in values]
             columns.append(packed_column(tag.removeprefix(name), plain_values))
-        tables.append({"name": name.rstrip("."), "rowCount": len(table), "columns": columns})
+        tables.append(
+            {
+                "name": name.rstrip("."),
+                "rowCount": len(table),
+                "columns": columns,
+            }
+        )
     content = msgpack.packb({"dataBlocks": [{"header": "made", "categories": tables}]})
     path = tmp_path / f"made{suffix}"
     path.write_bytes(gzip.compress(content) if suffix.endswith("gz") else content)
@@ -141,14 +174,35 @@ def test_it_is_the_molecule_of_the_same_mmcif(suffix, tmp_path):
 @pytest.mark.parametrize(
     ("file", "said"),
     [
-        (file_of(2**40, column("id", packed([1], INT8))), "more than .* values"),
         (
-            file_of(9, column("id", packed([1, 2**30], {"kind": "RunLength"}, INT32))),
+            file_of(
+                2**40,
+                column("id", packed([1], INT8)),
+            ),
+            "more than .* values",
+        ),
+        (
+            file_of(
+                9,
+                column("id", packed([1, 2**30], {"kind": "RunLength"}, INT32)),
+            ),
             "more than .* rows",
         ),
         (file_of(3, column("id", packed([1], INT8))), "_atom_site.id has not 3 rows"),
-        (file_of(1, column("id", packed([1], {"kind": "Zip"}, INT8))), "unknown encoding Zip"),
-        (file_of(1, column("id", strings(["1"]) | {"data": b"\xf0\xff\xff\xff"})), "KeyError"),
+        (
+            file_of(
+                1,
+                column("id", packed([1], {"kind": "Zip"}, INT8)),
+            ),
+            "unknown encoding Zip",
+        ),
+        (
+            file_of(
+                1,
+                column("id", strings(["1"]) | {"data": b"\xf0\xff\xff\xff"}),
+            ),
+            "KeyError",
+        ),
         ({"dataBlocks": [[]] * 2**18}, "more than .* lists and maps"),
         ({"dataBlocks": [{"header": 1}]}, "no BinaryCIF"),
         ([1, 2], "no BinaryCIF"),

@@ -26,7 +26,12 @@ def write(path, values, order=(1, 2, 3), told="start"):
     """Write values (X, Y, Z) with columns, rows and sections along the axes (1 to 3) in `order`."""
     columns, rows, sections = (axis - 1 for axis in order)
     with mrcfile.new(path) as file:
-        file.set_data(np.ascontiguousarray(values.transpose(sections, rows, columns), np.float32))
+        file.set_data(
+            np.ascontiguousarray(
+                values.transpose(sections, rows, columns),
+                np.float32,
+            )
+        )
         header = file.header
         header.mx, header.my, header.mz = values.shape
         header.cella = tuple(SIDES * values.shape)
@@ -43,13 +48,19 @@ def ball(radius=6.0):
 
 
 @pytest.mark.parametrize("told", ["start", "origin"])
-@pytest.mark.parametrize("order", [(1, 2, 3), (3, 1, 2), (2, 1, 3)])
+@pytest.mark.parametrize(
+    "order",
+    [(1, 2, 3), (3, 1, 2), (2, 1, 3)],
+)
 def test_a_ball_lies_where_the_header_says_whatever_the_order_of_axes(order, told, tmp_path):
     path = write(tmp_path / "ball.mrc", ball(), order, told)
     mesh = load_mesh(path, LoadOptions(threshold=0.5))
     away = norm(mesh.vertices - CENTRE, axis=1)
     np.testing.assert_allclose(away, 5.5, atol=0.05)
-    expected = pytest.approx(4 / 3 * np.pi * 5.5**3, rel=0.01)
+    expected = pytest.approx(
+        4 / 3 * np.pi * 5.5**3,
+        rel=0.01,
+    )
     assert mesh.volume == expected
     expected = pytest.approx(4 * np.pi * 5.5**2, rel=0.01)
     assert mesh.area == expected
@@ -74,7 +85,10 @@ def test_a_box_at_the_border_is_closed_there(tmp_path):
     values = np.zeros(SHAPE)
     values[:20, 10:22, 5:25] = 1
     mesh = load_mesh(write(tmp_path / "box.mrc", values), LoadOptions(threshold=0.5))
-    expected = pytest.approx(20 * 12 * 20 * SIDES.prod(), rel=0.02)
+    expected = pytest.approx(
+        20 * 12 * 20 * SIDES.prod(),
+        rel=0.02,
+    )
     assert mesh.volume == expected
     assert "at the border of the map: closed there" in mesh.notes
     low = (START + np.array([-0.5, 9.5, 4.5])) * SIDES
@@ -83,10 +97,16 @@ def test_a_box_at_the_border_is_closed_there(tmp_path):
 
 
 def test_dust_is_left_out_and_hollows_are_filled_with_notes(tmp_path):
-    values = np.minimum(ball(), norm(points() - CENTRE, axis=-1) - 2.0)
+    values = np.minimum(
+        ball(),
+        norm(points() - CENTRE, axis=-1) - 2.0,
+    )
     values[2, 2, 2] = values[37, 3, 3] = 1.0
     mesh = load_mesh(write(tmp_path / "shell.mrc", values), LoadOptions(threshold=0.0))
-    expected = pytest.approx(4 / 3 * np.pi * 6**3, rel=0.01)
+    expected = pytest.approx(
+        4 / 3 * np.pi * 6**3,
+        rel=0.01,
+    )
     assert mesh.volume == expected
     assert "1 hollow inside: filled" in mesh.notes
     assert any(note.startswith("left out 2 small pieces, 0.") for note in mesh.notes)

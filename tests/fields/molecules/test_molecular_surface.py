@@ -23,15 +23,26 @@ ASLANT = np.array([2.0, -1.0, 1.5]) / norm([2.0, -1.0, 1.5])
 def chain(n, seed=0):
     """A random walk of steps of 1.5 Å."""
     steps = np.random.default_rng(seed).normal(size=(n, 3))
-    return np.cumsum(1.5 * steps / norm(steps, axis=1, keepdims=True), axis=0)
+    return np.cumsum(
+        1.5 * steps / norm(steps, axis=1, keepdims=True),
+        axis=0,
+    )
 
 
 @pytest.mark.parametrize(
     ("kind", "added", "radius"),
-    [("excluded", 0.0, 1.5), ("accessible", PROBE, 1.8), ("van_der_waals", 0.0, 3.0)],
+    [
+        ("excluded", 0.0, 1.5),
+        ("accessible", PROBE, 1.8),
+        ("van_der_waals", 0.0, 3.0),
+    ],
 )
 def test_a_ball_has_its_area_and_volume(kind, added, radius):
-    mesh = molecular_surface(molecule([0.1, 0.2, 0.3], radius), kind, spacing=0.5)
+    mesh = molecular_surface(
+        molecule([0.1, 0.2, 0.3], radius),
+        kind,
+        spacing=0.5,
+    )
     expected = pytest.approx(ball(radius + added), rel=0.01)
     assert (mesh.area, mesh.volume) == expected
     away = norm(mesh.vertices - [0.1, 0.2, 0.3], axis=1)
@@ -41,19 +52,28 @@ def test_a_ball_has_its_area_and_volume(kind, added, radius):
 
 @pytest.mark.parametrize("apart", [0.8, 2.5, 3.6, 4.6])
 def test_the_excluded_surface_of_two_balls_is_two_caps_and_a_saddle(apart):
-    two = molecule([0.3 * ASLANT, (0.3 + apart) * ASLANT], (1.9, 1.5))
+    two = molecule(
+        [0.3 * ASLANT, (0.3 + apart) * ASLANT],
+        (1.9, 1.5),
+    )
     mesh = molecular_surface(two, spacing=0.5)
     expected = excluded_of_two(1.9, 1.5, apart, PROBE)
     assert (mesh.area, mesh.volume) == pytest.approx(expected, rel=0.01)
     assert mesh.genus == 0
 
 
-@pytest.mark.parametrize("radii", [(1.7, 1.7), (1.9, 1.5)])
+@pytest.mark.parametrize(
+    "radii",
+    [(1.7, 1.7), (1.9, 1.5)],
+)
 @pytest.mark.parametrize("apart", [5.2, 5.5, 6.2])
 def test_where_the_neck_is_too_thin_for_the_grid_or_none_a_thread_adds_hardly_any_area(
     radii, apart
 ):
-    mesh = molecular_surface(molecule([0.3 * ASLANT, (0.3 + apart) * ASLANT], radii), spacing=0.5)
+    mesh = molecular_surface(
+        molecule([0.3 * ASLANT, (0.3 + apart) * ASLANT], radii),
+        spacing=0.5,
+    )
     closed_form = np.add(ball(radii[0]), ball(radii[1]))
     if apart < 6:
         closed_form = excluded_of_two(*radii, apart, PROBE)
@@ -64,7 +84,10 @@ def test_where_the_neck_is_too_thin_for_the_grid_or_none_a_thread_adds_hardly_an
 
 def test_far_balls_are_joined_by_threads():
     radii = [1.7, 2.5, 2.0]
-    apart = molecule([0 * ASLANT, 9 * ASLANT, [20, 0, 0]], radii)
+    apart = molecule(
+        [0 * ASLANT, 9 * ASLANT, [20, 0, 0]],
+        radii,
+    )
     whole = molecular_surface(apart, spacing=0.5, max_vertices=600)
     expected = np.sum([ball(r) for r in radii], axis=0).tolist()
     assert [whole.area, whole.volume] == pytest.approx(expected, rel=0.01)
@@ -82,20 +105,37 @@ def test_the_accessible_surface_of_two_balls_is_that_of_larger_ones(apart):
 
 
 def test_a_speck_is_left_out_with_a_note_but_not_what_all_is_made_of(monkeypatch):
-    found = molecular_surface(molecule([[0, 0, 0], [14, 0, 0]], [8.0, 0.9]))
+    found = molecular_surface(
+        molecule(
+            [[0, 0, 0], [14, 0, 0]],
+            [8.0, 0.9],
+        )
+    )
     assert "left out 1 speck" in found.notes
-    expected = pytest.approx(4 / 3 * np.pi * 8**3, rel=0.01)
+    expected = pytest.approx(
+        4 / 3 * np.pi * 8**3,
+        rel=0.01,
+    )
     assert found.volume == expected
     # As if there were some hundreds
     monkeypatch.setattr("igps.fields.molecules.molecular_surface.SPECK_VOLUME", 0.2)
-    found = molecular_surface(molecule([[9.0 * i, 0, 0] for i in range(6)], [1.7] * 6), spacing=0.5)
-    expected = pytest.approx(6 * 4 / 3 * np.pi * 1.7**3, rel=0.02)
+    found = molecular_surface(
+        molecule([[9.0 * i, 0, 0] for i in range(6)], [1.7] * 6),
+        spacing=0.5,
+    )
+    expected = pytest.approx(
+        6 * 4 / 3 * np.pi * 1.7**3,
+        rel=0.02,
+    )
     assert found.volume == expected
 
 
 def test_a_ring_of_balls_has_a_hole():
     n, apart = 8, 4.2
-    mesh = molecular_surface(molecule(_ring(n, apart), np.full(n, 1.7)), spacing=0.5)
+    mesh = molecular_surface(
+        molecule(_ring(n, apart), np.full(n, 1.7)),
+        spacing=0.5,
+    )
     expected = excluded_of_ring(n, 1.7, apart, PROBE)
     assert (mesh.area, mesh.volume) == pytest.approx(expected, rel=0.01)
     assert mesh.genus == 1
@@ -116,13 +156,20 @@ def spiral(n):
     up = 1 - (2 * i + 1) / n
     turn = np.pi * (1 + 5**0.5) * i
     around = np.sqrt(1 - up**2)
-    return np.stack([around * np.cos(turn), around * np.sin(turn), up], axis=1)
+    return np.stack(
+        [around * np.cos(turn), around * np.sin(turn), up],
+        axis=1,
+    )
 
 
 def test_the_excluded_surface_is_a_probe_away_from_where_a_probe_may_be():
     """By brute force: places of the probe on fine spheres around all atoms."""
     at = chain(40)
-    mesh = molecular_surface(molecule(at, np.full(40, 1.7)), spacing=0.4, max_vertices=None)
+    mesh = molecular_surface(
+        molecule(at, np.full(40, 1.7)),
+        spacing=0.4,
+        max_vertices=None,
+    )
     places = (at[:, None] + (1.7 + PROBE) * spiral(6000)).reshape(-1, 3)
     free = cKDTree(at).query(places)[0] > 1.7 + PROBE - 1e-6
     distance = cKDTree(places[free]).query(mesh.vertices)[0]
@@ -136,7 +183,10 @@ def test_no_probe_is_the_surface_of_the_balls():
     without = molecular_surface(two, probe=0, spacing=0.5)
     expected = molecular_surface(two, "van_der_waals", spacing=0.5)
     np.testing.assert_array_equal(without.vertices, expected.vertices)
-    expected = pytest.approx(union_of_two(1.7, 1.7, 2.0)[1], rel=0.01)
+    expected = pytest.approx(
+        union_of_two(1.7, 1.7, 2.0)[1],
+        rel=0.01,
+    )
     assert without.volume == expected
 
 
@@ -149,7 +199,12 @@ def test_swallowed_and_doubled_balls_change_nothing():
 
 
 def test_hollows_are_filled():
-    mesh = molecular_surface(molecule(8 * spiral(120), np.full(120, 1.7)))
+    mesh = molecular_surface(
+        molecule(
+            8 * spiral(120),
+            np.full(120, 1.7),
+        )
+    )
     assert mesh.genus == 0
     assert mesh.volume > ball(8.0)[1]
     assert any("1 hollow inside: filled" in note for note in mesh.notes)
@@ -185,12 +240,18 @@ def test_the_accessible_area_is_that_of_points_which_no_other_ball_covers():
         away = centre + 3.1 * directions[:, None] - np.delete(at, i, axis=0)
         distance = norm(away, axis=2)
         n_free += int((distance > 3.1).all(axis=1).sum())
-    expected = pytest.approx(4 * np.pi * 3.1**2 * n_free / 4000, rel=0.01)
+    expected = pytest.approx(
+        4 * np.pi * 3.1**2 * n_free / 4000,
+        rel=0.01,
+    )
     assert found == expected
 
 
 def test_stray_atoms_are_named_with_the_remedy():
-    far = molecule([[0, 0, 0], [9999, 9999, 9999]], [1.7, 1.7])
+    far = molecule(
+        [[0, 0, 0], [9999, 9999, 9999]],
+        [1.7, 1.7],
+    )
     words = "balls: expected a grid of .* Raise the spacing, or remove stray atoms"
     with pytest.raises(MeshError, match=words):
         molecular_surface(far)

@@ -24,9 +24,19 @@ from igps.mesh.options import LoadOptions
 pytest.importorskip("gemmi")
 
 COMPLETED = "{} residues were completed: balls stand for missing atoms of side chains"
-ALANINE = [("N", 0.0, 0.0), ("CA", 1.46, 0.0), ("C", 2.0, 1.4), ("O", 1.3, 2.4), ("CB", 2.0, -0.8)]
+ALANINE = [
+    ("N", 0.0, 0.0),
+    ("CA", 1.46, 0.0),
+    ("C", 2.0, 1.4),
+    ("O", 1.3, 2.4),
+    ("CB", 2.0, -0.8),
+]
 
-SULFUR = [("CG", 2.5, -1.5), ("CE", 3.5, -3.5), ("SD", 3.0, -2.0)]
+SULFUR = [
+    ("CG", 2.5, -1.5),
+    ("CE", 3.5, -3.5),
+    ("SD", 3.0, -2.0),
+]
 
 
 @dataclass(frozen=True)
@@ -253,7 +263,12 @@ def test_what_the_file_says_is_of_a_polymer_is_none_of_its_ligands(tmp_path):
 
 
 def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path):
-    water = [("OW", 9.0, 9.0), ("HW1", 9.5, 9.0), ("HW2", 9.0, 9.5), ("MW", 9.1, 9.1)]
+    water = [
+        ("OW", 9.0, 9.0),
+        ("HW1", 9.5, 9.0),
+        ("HW2", 9.0, 9.5),
+        ("MW", 9.1, 9.1),
+    ]
     ion = residue(3, "SOD", [("NA", 9.0, 0.0)])
     text = residue(1) + residue(2, "SOL", water) + ion + residue(4, "QQQ")
     (molecule,) = read_molecule(written(tmp_path, text))
@@ -261,7 +276,10 @@ def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path):
 
 
 def test_hydrogens_are_left_out_unless_asked_for(tmp_path):
-    path = written(tmp_path, residue(1, atoms=[*ALANINE, ("H", 0.0, -1.0)]))
+    path = written(
+        tmp_path,
+        residue(1, atoms=[*ALANINE, ("H", 0.0, -1.0)]),
+    )
     assert len(read_molecule(path)[0].radii) == 5
     assert len(read_molecule(path, hydrogens=True)[0].radii) == 6
 
@@ -301,7 +319,12 @@ LYSINE = [*backbone(), *side_chain("CG", "CD", "CE", "NZ")]
 @pytest.mark.parametrize("n_present", [1, 2, 4])
 def test_a_cut_side_chain_gets_what_it_lacks_at_its_last_atom(n_present, tmp_path):
     (whole,) = read_molecule(written(tmp_path, residue(1, "LYS", LYSINE)))
-    (cut,) = read_molecule(written(tmp_path, residue(1, "LYS", LYSINE[: 4 + n_present])))
+    (cut,) = read_molecule(
+        written(
+            tmp_path,
+            residue(1, "LYS", LYSINE[: 4 + n_present]),
+        )
+    )
     assert whole.notes == ()
     assert cut.notes == (COMPLETED.format(1),)
     assert cut.charges.sum() == whole.charges.sum() == 1
@@ -312,7 +335,13 @@ def test_a_cut_side_chain_gets_what_it_lacks_at_its_last_atom(n_present, tmp_pat
     expected = pytest.approx(share * (VOLUMES["LYS"] - VOLUMES["GLY"]))
     assert found == expected
     alpha = np.array([1.46, 0, 3.8])
-    last = np.array([2.0 + 0.6 * (n_present - 1), -0.8 - 1.2 * (n_present - 1), 3.8])
+    last = np.array(
+        [
+            2.0 + 0.6 * (n_present - 1),
+            -0.8 - 1.2 * (n_present - 1),
+            3.8,
+        ]
+    )
     out = (last - alpha) / norm(last - alpha)
     assert_allclose(ball, last + radius * out, atol=1e-9)
 
@@ -369,7 +398,11 @@ def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path):
 
 
 def test_unknown_elements_and_residues_are_kept_with_a_note(tmp_path):
-    odd = residue(2, atoms=[*ALANINE, ("X1", 3.0, -2.0), ("1HB", 3.0, -3.0)], element="Xx")
+    odd = residue(
+        2,
+        atoms=[*ALANINE, ("X1", 3.0, -2.0), ("1HB", 3.0, -3.0)],
+        element="Xx",
+    )
     (molecule,) = read_molecule(written(tmp_path, residue(1, "QQQ") + odd))
     found = molecule.radii[5:]
     expected = [1.55, 1.70, 1.70, 1.52, 1.70, 1.70]
@@ -400,7 +433,10 @@ def test_a_chain_without_atoms_costs_no_other_chain(tmp_path, caplog):
 
 
 def test_a_surface_that_fails_in_any_way_costs_no_other_chain(tmp_path, monkeypatch):
-    path = written(tmp_path, residue(1) + residue(1, chain="B") + residue(1, chain="C"))
+    path = written(
+        tmp_path,
+        residue(1) + residue(1, chain="B") + residue(1, chain="C"),
+    )
 
     def faulty(molecule):
         if "chain B" in molecule.name:
@@ -591,7 +627,12 @@ def test_atoms_in_one_place_are_refused_and_one_atom_is_told(tmp_path):
 
 def test_lipids_among_the_atoms_of_polymers_are_told(tmp_path):
     tail = [(f"C{i}", 1.5 * i, 8.0) for i in range(1, 6)]
-    (molecule,) = read_molecule(written(tmp_path, residue(1) + residue(2, "POP", tail)))
+    (molecule,) = read_molecule(
+        written(
+            tmp_path,
+            residue(1) + residue(2, "POP", tail),
+        )
+    )
     assert any("1 residues" in note and "lipids or detergents" in note for note in molecule.notes)
 
 

@@ -31,7 +31,16 @@ def peptide(*names, seed=0):
     charges = np.array([CHARGES.get(name, 0.0) for name in names])
     numbers = np.arange(n)
     b_factors = numbers.astype(float)
-    return Molecule("peptide", at, np.full(n, 2.0), charges, numbers, names, at, b_factors)
+    return Molecule(
+        "peptide",
+        at,
+        np.full(n, 2.0),
+        charges,
+        numbers,
+        names,
+        at,
+        b_factors,
+    )
 
 
 def points(n=7, seed=1):
@@ -111,10 +120,22 @@ def test_the_potential_of_one_charge_is_that_of_debye_and_hueckel():
     at = np.zeros((1, 3))
     radius = np.array([1.5])
     charge = np.array([-2.0])
-    ion = Molecule("ion", at, radius, charge, np.zeros(1, int), ("X",), at, np.zeros(1))
+    ion = Molecule(
+        "ion",
+        at,
+        radius,
+        charge,
+        np.zeros(1, int),
+        ("X",),
+        at,
+        np.zeros(1),
+    )
     distance = np.array([0.0, 1.0, 1.5, 4.0, 15.0])
     counted = np.maximum(distance, 1.5)
-    found = screened_potential(ion, distance[:, None] * [[0.6, 0, 0.8]])
+    found = screened_potential(
+        ion,
+        distance[:, None] * [[0.6, 0, 0.8]],
+    )
     # e² / (4 π ε₀ ε k T) in Å, of water (ε = 78.4) at 298.15 K; 0.304 nm / √0.15 of salt of one valence.
     thermal = 4 * np.pi * 8.8541878128e-12 * 78.4 * 1.380649e-23 * 298.15
     bjerrum = 1.602176634e-19**2 / thermal * 1e10
@@ -147,7 +168,11 @@ def test_each_attribute_is_known_by_its_name():
     molecule = peptide("ASP", "ALA", "LYS", "TRP")
     for name in RESIDUE_ATTRIBUTES:
         values = residue_attribute(molecule, points(), name)
-        columns = {"residue_shares": (len(RESIDUE_KINDS),), "trace": (7,), "composition": (26,)}
+        columns = {
+            "residue_shares": (len(RESIDUE_KINDS),),
+            "trace": (7,),
+            "composition": (26,),
+        }
         assert values.shape == (7, *columns.get(name, ()))
         assert np.isfinite(values).all()
     words = r"attributes: expected names among charge, .*, got 'colour'"

@@ -22,7 +22,10 @@ SEQUENCE = np.random.default_rng(0).choice(sorted(VOLUMES), N_RESIDUES).tolist()
 
 def coil():
     t = np.arange(N_RESIDUES)
-    return np.stack([1.5 * t, 6 * np.cos(1.3 * t), 6 * np.sin(1.3 * t)], axis=1)
+    return np.stack(
+        [1.5 * t, 6 * np.cos(1.3 * t), 6 * np.sin(1.3 * t)],
+        axis=1,
+    )
 
 
 def write(path, positions, names, first=1):
@@ -57,7 +60,10 @@ def test_the_turned_part_has_the_paint_in_both_and_structures_are_superposed(pai
         rows = list(csv.DictReader(file))
     arm = coil()[HINGE:] - coil()[HINGE]
     steps = np.zeros(N_RESIDUES)
-    steps[HINGE:] = np.linalg.norm(Rotation.from_rotvec([0.0, 1.0, 0.0]).apply(arm) - arm, axis=1)
+    steps[HINGE:] = np.linalg.norm(
+        Rotation.from_rotvec([0.0, 1.0, 0.0]).apply(arm) - arm,
+        axis=1,
+    )
     told = np.array([float(row["displacement"]) for row in rows]).reshape(2, N_RESIDUES)
     expected = np.stack([steps, steps])
     assert_allclose(told, expected, atol=0.02)

@@ -34,7 +34,11 @@ def files(tmp_path):
     """A topology with charges as PQR, and the frames as DCD."""
     frames = hinges()
     names = [f"C{i}" for i in range(1, 2 * N_ARM + 1)] + ["H1", "H2"]
-    charges = [*np.linspace(-0.5, 0.4, 2 * N_ARM), 0.25, -0.15]
+    charges = [
+        *np.linspace(-0.5, 0.4, 2 * N_ARM),
+        0.25,
+        -0.15,
+    ]
     text = ""
     for i, (x, y, z) in enumerate(frames[0]):
         text += f"ATOM {i + 1} {names[i]} ALA A 1 {x:.3f} {y:.3f} {z:.3f} {charges[i]:.4f} 1.0\n"

@@ -57,9 +57,16 @@ def test_no_whole_body_is_told_and_every_cut_one(tmp_path, capsys):
     """Whole balls one voxel from the border, and balls that a corner or a face cuts by a voxel or more."""
     inner = RADIUS + 0.5
     whole = {f"whole{i}": (inner, N - 1 - inner, 16.0 + i) for i in range(3)}
-    cut = {"corner": (5.0, 5.0, 5.0), "face": (RADIUS - 1.5, 16.0, 16.0), "half": (16.0, 16.0, N)}
+    cut = {
+        "corner": (5.0, 5.0, 5.0),
+        "face": (RADIUS - 1.5, 16.0, 16.0),
+        "half": (16.0, 16.0, N),
+    }
     for name, centre in {**whole, **cut}.items():
-        image = nibabel.Nifti1Image(ball(centre).astype(np.uint8), np.eye(4))
+        image = nibabel.Nifti1Image(
+            ball(centre).astype(np.uint8),
+            np.eye(4),
+        )
         nibabel.save(image, tmp_path / f"{name}.nii.gz")
     out = tmp_path / "table.csv"
     words = ["--descriptor", "measures", "--cache_dir", tmp_path / "cache", "--n_workers", 1]

@@ -39,7 +39,12 @@ def ellipsoid(r):
     a, b, c = axes
     area = 4 * np.pi * elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2)
     volume = 4 / 3 * np.pi * axes.prod()
-    return Solid(lambda p: ((p / axes) ** 2).sum(-1) < 1, axes, volume, area)
+    return Solid(
+        lambda p: ((p / axes) ** 2).sum(-1) < 1,
+        axes,
+        volume,
+        area,
+    )
 
 
 def torus(r):
@@ -49,7 +54,13 @@ def torus(r):
         return (np.hypot(p[..., 0], p[..., 1]) - ring) ** 2 + p[..., 2] ** 2 < r**2
 
     half = np.array([ring + r, ring + r, r])
-    return Solid(holds, half, 2 * np.pi**2 * ring * r**2, 4 * np.pi**2 * ring * r, 1)
+    return Solid(
+        holds,
+        half,
+        2 * np.pi**2 * ring * r**2,
+        4 * np.pi**2 * ring * r,
+        1,
+    )
 
 
 def capsule(r):
@@ -58,26 +69,46 @@ def capsule(r):
         return p[..., 0] ** 2 + p[..., 1] ** 2 + beyond**2 < r**2
 
     volume = (4 + 4 / 3) * np.pi * r**3
-    return Solid(holds, np.array([r, r, 3 * r]), volume, (8 + 4) * np.pi * r**2)
+    return Solid(
+        holds,
+        np.array([r, r, 3 * r]),
+        volume,
+        (8 + 4) * np.pi * r**2,
+    )
 
 
 def rod(r):
     def holds(p):
         return (np.hypot(p[..., 0], p[..., 1]) < r) & (abs(p[..., 2]) < 4 * r)
 
-    return Solid(holds, np.array([r, r, 4 * r]), 8 * np.pi * r**3, 18 * np.pi * r**2)
+    return Solid(
+        holds,
+        np.array([r, r, 4 * r]),
+        8 * np.pi * r**3,
+        18 * np.pi * r**2,
+    )
 
 
 def plate(r):
     half = r * np.array([3, 4, 1])
     a, b, c = half
     area = 8 * (a * b + b * c + a * c)
-    return Solid(lambda p: (abs(p) < half).all(-1), half, 8 * a * b * c, area)
+    return Solid(
+        lambda p: (abs(p) < half).all(-1),
+        half,
+        8 * a * b * c,
+        area,
+    )
 
 
 def ball(r):
     volume = 4 / 3 * np.pi * r**3
-    return Solid(lambda p: (p**2).sum(-1) < r**2, np.full(3, r), volume, 4 * np.pi * r**2)
+    return Solid(
+        lambda p: (p**2).sum(-1) < r**2,
+        np.full(3, r),
+        volume,
+        4 * np.pi * r**2,
+    )
 
 
 def voxels(body, matrix, rng):
@@ -85,7 +116,10 @@ def voxels(body, matrix, rng):
     turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
     size = norm(body.half)
     reach = np.ceil(norm(np.linalg.inv(matrix), axis=1) * size).astype(int) + 1
-    index = np.stack(np.meshgrid(*(np.arange(2 * n + 1) for n in reach), indexing="ij"), axis=-1)
+    index = np.stack(
+        np.meshgrid(*(np.arange(2 * n + 1) for n in reach), indexing="ij"),
+        axis=-1,
+    )
     affine = np.eye(4)
     affine[:3, :3] = matrix
     affine[:3, 3] = -matrix @ (reach + rng.uniform(-0.5, 0.5, 3))
@@ -100,14 +134,20 @@ def errors(body, matrix, rng):
     mesh = Mesh(vertices, faces)  # closed, manifold, oriented, of one piece
     assert mesh.notes == ()  # and not inside out
     assert mesh.genus == body.genus
-    centre = np.mean([vertices.min(axis=0), vertices.max(axis=0)], axis=0)
+    centre = np.mean(
+        [vertices.min(axis=0), vertices.max(axis=0)],
+        axis=0,
+    )
     expected = (100, -50, 20)
     assert_allclose(centre, expected, atol=np.abs(matrix).max())
     return abs(mesh.volume / body.volume - 1), abs(mesh.area / body.area - 1)
 
 
 @pytest.mark.parametrize("length", [1, 2.5, 6])
-@pytest.mark.parametrize(("n_voxels", "most"), [(9, (0.01, 0.02)), (4, (0.05, 0.08))])
+@pytest.mark.parametrize(
+    ("n_voxels", "most"),
+    [(9, (0.01, 0.02)), (4, (0.05, 0.08))],
+)
 def test_voxelised_bodies_give_back_volume_and_area(length, n_voxels, most):
     rng = default_rng([n_voxels, int(length)])
     matrix = 0.8 * np.diag(rng.permutation([1, 1, length]))
@@ -137,7 +177,10 @@ def test_the_unit_of_length_changes_nothing(unit):
     """Voxels of a nanometre and of a mouse's micro-CT in millimetres, and of a kilometre."""
     mask = voxels(torus(4.5), np.eye(3), default_rng(5))[0]
     vertices, faces, _ = voxel_surface(mask, np.diag([1, 1, 2, 1]))
-    found, triangles, _ = voxel_surface(mask, unit * np.diag([1, 1, 2, 1 / unit]))
+    found, triangles, _ = voxel_surface(
+        mask,
+        unit * np.diag([1, 1, 2, 1 / unit]),
+    )
     np.testing.assert_array_equal(triangles, faces)
     assert_allclose(found / unit, vertices, atol=1e-6)
 
@@ -150,7 +193,10 @@ def test_many_voxels_are_put_on_a_coarser_grid_and_nothing_is_lost_by_it():
     assert mesh.volume == pytest.approx(np.count_nonzero(mask), rel=1e-6)
     expected = pytest.approx(4 * np.pi * 60**2, rel=0.01)
     assert mesh.area == expected
-    radius = norm(mesh.vertices - (100, -50, 20), axis=1)
+    radius = norm(
+        mesh.vertices - (100, -50, 20),
+        axis=1,
+    )
     assert abs(radius - 60).max() < 0.5
 
 
@@ -159,7 +205,11 @@ def test_a_thin_ring_in_a_large_box_needs_little_memory_and_has_no_seams():
     tube, ring = 2.2, 100.0
     turn = Rotation.from_euler("xy", [40, 35], degrees=True).as_matrix()
     index = np.moveaxis(np.indices((211, 211, 211), dtype=np.float32), 0, -1) - 105
-    x, y, z = np.moveaxis((index + 0.3) @ turn.astype(np.float32), -1, 0)
+    x, y, z = np.moveaxis(
+        (index + 0.3) @ turn.astype(np.float32),
+        -1,
+        0,
+    )
     mask = (np.hypot(x, y) - ring) ** 2 + z**2 < tube**2
     del index, x, y, z
     tracemalloc.start()
@@ -171,11 +221,17 @@ def test_a_thin_ring_in_a_large_box_needs_little_memory_and_has_no_seams():
     assert box > 2**22  # voxels, of which blocks are made
     assert peak < 36 * box
     assert mesh.genus == 1
-    expected = pytest.approx(2 * np.pi**2 * ring * tube**2, rel=0.01)
+    expected = pytest.approx(
+        2 * np.pi**2 * ring * tube**2,
+        rel=0.01,
+    )
     assert mesh.volume == expected
     x, y, z = (mesh.vertices @ turn).T
     assert abs(np.hypot(np.hypot(x, y) - ring, z) - tube).max() < 0.6
-    expected = pytest.approx(4 * np.pi**2 * ring * tube, rel=0.03)
+    expected = pytest.approx(
+        4 * np.pi**2 * ring * tube,
+        rel=0.03,
+    )
     assert mesh.area == expected
 
 
@@ -194,14 +250,21 @@ def test_every_voxel_stays_on_its_side():
     import igl
 
     rng = default_rng(3)
-    mask, affine = voxels(torus(2.5), np.diag([1, 1, 2.0]), rng)
+    mask, affine = voxels(
+        torus(2.5),
+        np.diag([1, 1, 2.0]),
+        rng,
+    )
     vertices, faces, _ = voxel_surface(mask, affine)
     centres = np.argwhere(np.ones_like(mask)) @ affine[:3, :3].T + affine[:3, 3]
     held = igl.fast_winding_number(vertices, faces, centres) > 0.5
     assert np.count_nonzero(held != mask.ravel()) <= 0.001 * np.count_nonzero(mask)
 
 
-@pytest.mark.parametrize("direction", [(1, 0, 0), (1, 1, 1), (3, 2, 1)])
+@pytest.mark.parametrize(
+    "direction",
+    [(1, 0, 0), (1, 1, 1), (3, 2, 1)],
+)
 def test_a_rib_of_two_voxels_stays_one_body(direction):
     axis = np.array(direction) / norm(direction)
     points = np.stack(np.meshgrid(*3 * [np.arange(40.0)], indexing="ij"), axis=-1) - 19.6
@@ -263,21 +326,42 @@ def test_a_label_that_is_mostly_small_pieces_is_refused(more, lost):
     words = rf"lesions: {lost} separate pieces, each below 2% .* --bodies pieces; or"
     with pytest.raises(MeshError, match=words):
         voxel_surface(mask, joins=True, name="lesions")
-    pieces = label_bodies(LabelVolume((mask,), np.eye(4)), LoadOptions(bodies="pieces"))
+    pieces = label_bodies(
+        LabelVolume((mask,), np.eye(4)),
+        LoadOptions(bodies="pieces"),
+    )
     assert len(pieces) == 121
     assert pieces[0].made().fault is None
 
 
 def rod_across(angle, radius=6.0, length=30.0, n=52):
     """A capsule so many degrees off the third axis, in voxels of side 1."""
-    axis = np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
+    axis = np.array(
+        [
+            np.sin(np.radians(angle)),
+            0,
+            np.cos(np.radians(angle)),
+        ]
+    )
     points = np.moveaxis(np.indices((n, n, n)), 0, -1) - (n - 1) / 2
     along = np.clip(points @ axis, -length / 2, length / 2)
-    return np.asarray(norm(points - along[..., None] * axis, axis=-1) < radius)
+    return np.asarray(
+        norm(
+            points - along[..., None] * axis,
+            axis=-1,
+        )
+        < radius
+    )
 
 
 @pytest.mark.parametrize(
-    ("angle", "axis", "n_missed"), [(0, 2, 3), (25, 2, 1), (40, 2, 2), (60, 0, 2)]
+    ("angle", "axis", "n_missed"),
+    [
+        (0, 2, 3),
+        (25, 2, 1),
+        (40, 2, 2),
+        (60, 0, 2),
+    ],
 )
 def test_slices_that_were_missed_are_filled(angle, axis, n_missed):
     """Closed forms of the whole capsule; joining the parts by a bar would lose a tenth of the volume and add area."""
@@ -288,9 +372,15 @@ def test_slices_that_were_missed_are_filled(angle, axis, n_missed):
     assert "slices that were missed" in notes[0]
     mesh = Mesh(vertices, faces)
     assert mesh.genus == 0
-    expected = pytest.approx(np.pi * (36 * 30 + 4 / 3 * 216), rel=0.02)
+    expected = pytest.approx(
+        np.pi * (36 * 30 + 4 / 3 * 216),
+        rel=0.02,
+    )
     assert mesh.volume == expected
-    expected = pytest.approx(2 * np.pi * 6 * (30 + 2 * 6), rel=0.02)
+    expected = pytest.approx(
+        2 * np.pi * 6 * (30 + 2 * 6),
+        rel=0.02,
+    )
     assert mesh.area == expected
 
 
@@ -340,11 +430,17 @@ def test_what_is_no_body_is_refused_with_its_count():
     with pytest.raises(MeshError, match="liver: expected at least 8 voxels, got 7"):
         voxel_surface(mask, name="liver")
     with pytest.raises(MeshError, match="singular"):
-        voxel_surface(np.ones((9, 9, 9)), np.diag([1.0, 1, 0, 1]))
+        voxel_surface(
+            np.ones((9, 9, 9)),
+            np.diag([1.0, 1, 0, 1]),
+        )
     with pytest.raises(MeshError, match=r"got shape \(9, 9\)"):
         voxel_surface(np.ones((9, 9)))
     with pytest.raises(MeshError, match="finite matrix"):
-        voxel_surface(np.ones((9, 9, 9)), np.full((4, 4), np.nan))
+        voxel_surface(
+            np.ones((9, 9, 9)),
+            np.full((4, 4), np.nan),
+        )
 
 
 def test_a_thin_label_has_the_volume_of_its_voxels():

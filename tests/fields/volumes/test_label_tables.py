@@ -16,7 +16,10 @@ SMALL = SignatureConfig(n_eigenpairs=10, min_samples=50, n_surface_samples=50)
 
 def write(path, numbers):
     """Boxes in a row, each 8 voxels high, one smaller than the next."""
-    labels = np.zeros((8 * len(numbers) + 4, 12, 12), dtype=np.uint8)
+    labels = np.zeros(
+        (8 * len(numbers) + 4, 12, 12),
+        dtype=np.uint8,
+    )
     if max(numbers) > 255:
         labels = labels.astype(np.uint16)
     for i, number in enumerate(numbers):

@@ -44,7 +44,10 @@ def two_boxes():
 
 
 def itk_image(labels, affine=AFFINE, vector=False):
-    image = sitk.GetImageFromArray(np.ascontiguousarray(np.swapaxes(labels, 0, 2)), isVector=vector)
+    image = sitk.GetImageFromArray(
+        np.ascontiguousarray(np.swapaxes(labels, 0, 2)),
+        isVector=vector,
+    )
     lps = np.diag([-1, -1, 1, 1]) @ affine
     spacing = norm(lps[:3, :3], axis=0)
     image.SetSpacing(spacing.tolist())
@@ -109,7 +112,10 @@ def write_segmentation(path, masks, names, *kind):
         plane.Columns = masks.shape[0]
         plane.PixelSpacing = [spacing[1], spacing[0]]
         plane.SliceThickness = spacing[2]
-        plane.ImageOrientationPatient = [*(lps[:3, 0] / spacing[0]), *(lps[:3, 1] / spacing[1])]
+        plane.ImageOrientationPatient = [
+            *(lps[:3, 0] / spacing[0]),
+            *(lps[:3, 1] / spacing[1]),
+        ]
         plane.ImagePositionPatient = list(lps[:3, 3] + k * lps[:3, 2])
         plane.BitsAllocated = plane.BitsStored = 16
         plane.SamplesPerPixel = 1
@@ -168,7 +174,13 @@ def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path):
     stack = np.ascontiguousarray(two_boxes().T)
     metadata = {"spacing": 2.0, "unit": "um", "axes": "ZYX"}
     path = tmp_path / "x.tif"
-    tifffile.imwrite(path, stack, imagej=True, resolution=(2, 4), metadata=metadata)
+    tifffile.imwrite(
+        path,
+        stack,
+        imagej=True,
+        resolution=(2, 4),
+        metadata=metadata,
+    )
     volume = read_label_volume(tmp_path / "x.tif")
     found = np.diag(volume.affine)
     expected = [0.5e-3, 0.25e-3, 2e-3, 1]
@@ -258,11 +270,20 @@ def test_a_nrrd_axis_without_a_direction_is_refused(lost, tmp_path):
 
 @pytest.mark.parametrize("kind", ["Nifti1Pair", "Nifti2Image"])
 @pytest.mark.parametrize(
-    ("unit", "side"), [("meter", 1e-3), ("mm", 1), ("micron", 1e3), ("unknown", 1)]
+    ("unit", "side"),
+    [
+        ("meter", 1e-3),
+        ("mm", 1),
+        ("micron", 1e3),
+        ("unknown", 1),
+    ],
 )
 def test_lengths_of_nifti_are_in_its_unit(kind, unit, side):
     """Pairs of a header and its voxels, too, which nibabel reads."""
-    image = getattr(nibabel, kind)(two_boxes(), np.diag([side, side, side, 1.0]) @ AFFINE)
+    image = getattr(nibabel, kind)(
+        two_boxes(),
+        np.diag([side, side, side, 1.0]) @ AFFINE,
+    )
     image.header.set_xyzt_units(unit)
     assert_allclose(volume_in_memory(image).affine, AFFINE, rtol=1e-6)
 
@@ -270,7 +291,10 @@ def test_lengths_of_nifti_are_in_its_unit(kind, unit, side):
 @pytest.mark.parametrize("order", ["RAS", "PIL"])
 @pytest.mark.parametrize("suffix", ["nii.gz", "nrrd", "mha"])
 def test_the_order_of_the_axes_in_a_file_is_no_matter(order, suffix, tmp_path):
-    sitk.WriteImage(sitk.DICOMOrient(itk_image(two_boxes()), order), str(tmp_path / f"x.{suffix}"))
+    sitk.WriteImage(
+        sitk.DICOMOrient(itk_image(two_boxes()), order),
+        str(tmp_path / f"x.{suffix}"),
+    )
     expected = label_surface(LabelVolume((two_boxes(),), AFFINE), 3)
     found = load_mesh(tmp_path / f"x.{suffix}", part="3")
     assert_allclose(found.vertices, expected.vertices, atol=1e-5)
@@ -330,7 +354,10 @@ def test_voxels_beside_their_header(name, tmp_path):
 def test_segments_of_slicer_have_names_and_may_overlap(tmp_path):
     one = two_boxes() == 3
     two = two_boxes() > 0
-    image = itk_image(np.stack([one, two], axis=-1).astype(np.uint8), vector=True)
+    image = itk_image(
+        np.stack([one, two], axis=-1).astype(np.uint8),
+        vector=True,
+    )
     for number, name in enumerate(("liver", "body")):
         image.SetMetaData(f"Segment{number}_Name", name)
         image.SetMetaData(f"Segment{number}_LabelValue", "1")
@@ -346,7 +373,10 @@ def test_segments_of_slicer_have_names_and_may_overlap(tmp_path):
 def test_groups_of_labels_of_mitk_have_names_and_may_overlap(tmp_path):
     liver = (two_boxes() == 3) * 1
     others = (two_boxes() > 0) * 2 + (two_boxes() == 7)
-    image = itk_image(np.stack([liver, others], axis=-1).astype(np.uint16), vector=True)
+    image = itk_image(
+        np.stack([liver, others], axis=-1).astype(np.uint16),
+        vector=True,
+    )
     groups = [
         {"labels": [{"name": "liver", "value": 1, "opacity": 0.6}]},
         {"labels": [{"name": "left", "value": 2}, {"name": "right", "value": 3}]},
@@ -356,13 +386,20 @@ def test_groups_of_labels_of_mitk_have_names_and_may_overlap(tmp_path):
     image.SetMetaData("org.mitk.multilabel.segmentation.labelgroups", json.dumps(groups))
     sitk.WriteImage(image, str(tmp_path / "x.nrrd"))
     bodies = label_bodies(read_label_volume(tmp_path / "x.nrrd"))
-    expected = [(1, "liver", 384), (2, "left", 384), (3, "right", 320)]
+    expected = [
+        (1, "liver", 384),
+        (2, "left", 384),
+        (3, "right", 320),
+    ]
     assert bodies == expected
 
 
 def test_segments_of_slicer_before_4_11_each_have_a_layer(tmp_path):
     """It wrote no values and no layers; names are on one line, as in every table."""
-    layers = np.stack([two_boxes() == 3, two_boxes() > 0], axis=-1)
+    layers = np.stack(
+        [two_boxes() == 3, two_boxes() > 0],
+        axis=-1,
+    )
     image = itk_image(layers.astype(np.uint8), vector=True)
     for number, name in enumerate(("left  kidney ", "body")):
         image.SetMetaData(f"Segment{number}_Name", name)
@@ -382,18 +419,31 @@ def test_segments_of_dicom_have_names_and_may_overlap(overlap, tmp_path):
     masks[..., 1] |= overlap * masks[..., 0]
     write_segmentation(tmp_path / "x.dcm", masks, ["liver", "spleen"], "BINARY")
     bodies = label_bodies(read_label_volume(tmp_path / "x.dcm"))
-    expected = [(1, "liver", 384), (2, "spleen", 704 if overlap else 320)]
+    expected = [
+        (1, "liver", 384),
+        (2, "spleen", 704 if overlap else 320),
+    ]
     assert bodies == expected
 
 
 @pytest.mark.parametrize("most", [255, 100])
 def test_fractional_segments_of_dicom_are_cut_at_the_threshold(most, tmp_path):
     """Three that overlap, in other slices each, the last all or nothing; the frames are read by pydicom."""
-    place = np.moveaxis(np.indices((24, 20, 16)), 0, -1)
+    place = np.moveaxis(
+        np.indices((24, 20, 16)),
+        0,
+        -1,
+    )
     soft = (((9, 9, 6), 5), ((14, 10, 9), 4))
     shares = []
     for centre, radius in soft:
-        shares.append(np.clip(1.5 - norm(place - centre, axis=-1) / radius, 0, 1))
+        shares.append(
+            np.clip(
+                1.5 - norm(place - centre, axis=-1) / radius,
+                0,
+                1,
+            )
+        )
     shares.append(norm(place - (8, 9, 8), axis=-1) < 4)
     names = ["liver", "tumour  (left)", "vessel"]
     path = tmp_path / "x.dcm"
@@ -539,7 +589,10 @@ def test_a_mask_without_names_is_called_by_its_file(tmp_path):
 
 
 def test_a_mask_of_255_is_called_by_its_file_too(tmp_path):
-    write_nibabel(tmp_path / "prostate.nii.gz", (two_boxes() == 3).astype(np.uint8) * 255)
+    write_nibabel(
+        tmp_path / "prostate.nii.gz",
+        (two_boxes() == 3).astype(np.uint8) * 255,
+    )
     assert label_bodies(read_label_volume(tmp_path / "prostate.nii.gz")) == [(255, "prostate", 384)]
     labels = np.select([two_boxes() == 3, two_boxes() == 7], [255, 254]).astype(np.uint8)
     write_nibabel(tmp_path / "labels.nii.gz", labels)
@@ -559,9 +612,15 @@ def test_labels_that_were_given_as_numbers_with_a_fraction_are_whole_again(tmp_p
 
 
 def test_probabilities_are_cut_at_the_threshold(tmp_path):
-    ball = norm(np.indices((20, 20, 20)) - 9.5, axis=0)
+    ball = norm(
+        np.indices((20, 20, 20)) - 9.5,
+        axis=0,
+    )
     shares = np.clip(1.5 - ball / 8, 0, 1).astype(np.float32)
-    nibabel.save(nibabel.Nifti1Image(shares, np.eye(4)), tmp_path / "x.nii")
+    nibabel.save(
+        nibabel.Nifti1Image(shares, np.eye(4)),
+        tmp_path / "x.nii",
+    )
     radius = {}
     for threshold in (0.5, 0.75):
         volume = read_label_volume(tmp_path / "x.nii", LoadOptions(threshold=threshold))
@@ -571,7 +630,10 @@ def test_probabilities_are_cut_at_the_threshold(tmp_path):
     expected = pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
     assert radius == expected
     shares = np.clip(0.9 - ball / 8, 0, 1).astype(np.float32)
-    nibabel.save(nibabel.Nifti1Image(shares, np.eye(4)), tmp_path / "y.nii")
+    nibabel.save(
+        nibabel.Nifti1Image(shares, np.eye(4)),
+        tmp_path / "y.nii",
+    )
     words = r"no voxel has a label, all are 0 \(probabilities: .* from 0\.95 on\)\. Check"
     with pytest.raises(MeshError, match=words):
         read_label_volume(tmp_path / "y.nii", LoadOptions(threshold=0.95))
@@ -586,7 +648,10 @@ def test_labels_as_floating_point_numbers_take_no_more_memory_than_is_asked_for(
     volume = volume_in_memory(labels, (1, 1, 1))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    expected = [(7, "7", 70 * 50 * 90), (300, "300", 10 * 120 * 120)]
+    expected = [
+        (7, "7", 70 * 50 * 90),
+        (300, "300", 10 * 120 * 120),
+    ]
     assert label_bodies(volume) == expected
     assert peak < 4 * labels.size
 
@@ -600,16 +665,25 @@ def test_an_array_without_voxels_is_refused_in_a_sentence(dtype):
 
 def test_probabilities_may_overshoot(tmp_path):
     """SPM keeps them as bytes times 1/255 in single precision, so that the largest is more than 1."""
-    ball = norm(np.indices((20, 20, 20)) - 9.5, axis=0)
+    ball = norm(
+        np.indices((20, 20, 20)) - 9.5,
+        axis=0,
+    )
     share = np.clip(1.5 - ball / 8, 0, 1)
-    image = nibabel.Nifti1Image(np.round(share * 255).astype(np.uint8), np.eye(4))
+    image = nibabel.Nifti1Image(
+        np.round(share * 255).astype(np.uint8),
+        np.eye(4),
+    )
     header = bytearray(image.header.binaryblock)
     header[108:120] = np.array([352, 1 / 255, 0], dtype="<f4").tobytes()
     header[344:348] = b"n+1\0"
     (tmp_path / "x.nii").write_bytes(header + bytes(4) + image.dataobj.tobytes(order="F"))
     assert np.asarray(nibabel.load(tmp_path / "x.nii").dataobj).max() > 1
     below = (share - 1e-6 * (share == 0)).astype(np.float32)
-    nibabel.save(nibabel.Nifti1Image(below, np.eye(4)), tmp_path / "y.nii")
+    nibabel.save(
+        nibabel.Nifti1Image(below, np.eye(4)),
+        tmp_path / "y.nii",
+    )
     for name in ("x.nii", "y.nii"):
         (body,) = read_label_volume(tmp_path / name).bodies
         assert body.n_voxels == (ball <= 8).sum()
@@ -632,7 +706,10 @@ def nifti(path, values, affine=AFFINE):
 
 
 def cut_short(path):
-    nifti(path, default_rng(0).integers(0, 3, (40, 40, 40)).astype(np.uint8))
+    nifti(
+        path,
+        default_rng(0).integers(0, 3, (40, 40, 40)).astype(np.uint8),
+    )
     path.write_bytes(path.read_bytes()[:3000])
 
 
@@ -658,11 +735,18 @@ def singular(path):
 def unusable_values():
     """Arrays that are no labels, by what they are."""
     labels = two_boxes()
-    scan = default_rng(0).normal(120, 15, (40, 40, 40))
+    scan = default_rng(0).normal(
+        120,
+        15,
+        (40, 40, 40),
+    )
     scan[:20] = 24  # a background that is not 0
     return {
         "4D": np.stack([labels, labels], axis=-1),
-        "colours": np.zeros((4, 4, 4), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")]),
+        "colours": np.zeros(
+            (4, 4, 4),
+            dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")],
+        ),
         "complex": labels.astype(np.complex64),
         "NaN": np.where(labels == 3, np.nan, labels).astype(np.float32),
         "negative": labels.astype(np.int16) - 1,
@@ -706,7 +790,11 @@ def test_what_is_no_label_volume_is_refused_in_a_sentence(kind, words, tmp_path)
 
 
 def test_many_labels_as_small_as_they_may_be_are_no_image():
-    block = np.repeat(np.repeat(np.repeat(np.arange(1, 217).reshape(6, 6, 6), 2, 0), 2, 1), 2, 2)
+    block = np.repeat(
+        np.repeat(np.repeat(np.arange(1, 217).reshape(6, 6, 6), 2, 0), 2, 1),
+        2,
+        2,
+    )
     found = {body.n_voxels for body in LabelVolume((block,), np.eye(4)).bodies}
     assert found == {8}
 
@@ -733,14 +821,21 @@ def test_labels_of_one_name_are_told_apart_by_their_numbers(tmp_path):
     names = [(body.label, body.name) for body in volume.bodies]
     assert names == [(3, "rib (3)"), (5, "liver"), (7, "rib (7)")]
     rib = label_surface(volume, "rib (7)")
-    expected = pytest.approx((labels == 7).sum() * 3.75, rel=1e-3)
+    expected = pytest.approx(
+        (labels == 7).sum() * 3.75,
+        rel=1e-3,
+    )
     assert rib.volume == expected
     assert rib.notes == ()
     words = r"x\.nii: no label 'rib'\. It has 3: rib \(3\), liver, rib \(7\)"
     with pytest.raises(MeshError, match=words):
         volume.body("rib")
     with pytest.raises(MeshError, match=r"labels 3 and 5 are both named 'rib \(3\)'.*Rename"):
-        LabelVolume((labels,), AFFINE, names={3: "rib", 7: "rib", 5: "rib (3)"})
+        LabelVolume(
+            (labels,),
+            AFFINE,
+            names={3: "rib", 7: "rib", 5: "rib (3)"},
+        )
 
 
 def test_a_name_that_is_the_number_of_another_label_is_the_name(tmp_path):
@@ -748,7 +843,10 @@ def test_a_name_that_is_the_number_of_another_label_is_the_name(tmp_path):
     nifti(tmp_path / "x.nii", two_boxes())
     (tmp_path / "x.csv").write_text("label,name\n3,11\n7,3\n")
     volumes = {ref.part: mesh.volume for ref, mesh in each_body(tmp_path / "x.nii")}
-    expected = pytest.approx({"11": 384 * 3.75, "3": 320 * 3.75}, rel=1e-3)
+    expected = pytest.approx(
+        {"11": 384 * 3.75, "3": 320 * 3.75},
+        rel=1e-3,
+    )
     assert volumes == expected
     found = load_mesh(tmp_path / "x.nii", part="3").volume
     expected = pytest.approx(320 * 3.75, rel=1e-3)
@@ -761,7 +859,10 @@ def test_a_name_that_is_the_number_of_another_label_is_the_name(tmp_path):
 
 def test_pieces_of_a_volume_are_what_does_not_touch_whatever_its_label(tmp_path):
     """Each with the volume of its voxels; they were joined by bars to one."""
-    labels = np.pad(two_boxes(), ((0, 16), (0, 0), (0, 0)))
+    labels = np.pad(
+        two_boxes(),
+        ((0, 16), (0, 0), (0, 0)),
+    )
     labels[20:28, 2:10, 1:9] = 3
     labels[16, 0, 0:3] = 3
     nifti(tmp_path / "x.nii", labels)
@@ -774,7 +875,10 @@ def test_pieces_of_a_volume_are_what_does_not_touch_whatever_its_label(tmp_path)
         assert mesh.unit == "mm"
     with pytest.raises(MeshError, match="2 connected components"):
         load_mesh(tmp_path / "x.nii", LoadOptions(bodies="whole", mend="never"))
-    nifti(tmp_path / "y.nii", labels * (np.arange(30) == 16)[:, None, None].astype(np.uint8))
+    nifti(
+        tmp_path / "y.nii",
+        labels * (np.arange(30) == 16)[:, None, None].astype(np.uint8),
+    )
     with pytest.raises(MeshError, match=r"y\.nii#piece 1: expected at least 8 voxels, got 3"):
         load_mesh(tmp_path / "y.nii", options)
 
@@ -854,10 +958,19 @@ def test_thin_branches_are_not_taken_for_noise():
     ends = [np.array([48.0, 48.0, 4.0])]
     for _ in range(60):
         start = ends[random.integers(len(ends))]
-        ends.append(np.clip(start + random.normal(0, 18, 3), 4, 91))
+        ends.append(
+            np.clip(
+                start + random.normal(0, 18, 3),
+                4,
+                91,
+            )
+        )
         way = np.linspace(start, ends[-1], 200)
         for at in np.round(way).astype(int):
             mask[tuple(slice(i, i + 2) for i in at)] = 1
-    mesh = label_surface(LabelVolume((mask,), np.eye(4)), 1)
+    mesh = label_surface(
+        LabelVolume((mask,), np.eye(4)),
+        1,
+    )
     assert mesh.volume == pytest.approx(mask.sum(), rel=2e-3)
     assert mesh.notes == ()

@@ -31,21 +31,35 @@ def view(kind="interior"):
 
 
 def test_hats_are_the_linear_kernel():
-    values = torch.tensor([0.0, 0.1, 0.3, 0.35, 0.5, 0.9, 1.0, 5.0], dtype=torch.float64)
+    values = torch.tensor(
+        [0.0, 0.1, 0.3, 0.35, 0.5, 0.9, 1.0, 5.0],
+        dtype=torch.float64,
+    )
     centres = [0.1, 0.35, 0.4, 0.95]
     expected = [hat(float(value), centres) for value in values]
     result = soft_memberships(values, torch.tensor(centres, dtype=torch.float64))
     assert_allclose(result, expected, atol=1e-14)
     assert torch.equal(
-        soft_memberships(values, torch.tensor([0.4])), torch.ones(8, 1, dtype=torch.float64)
+        soft_memberships(
+            values,
+            torch.tensor([0.4]),
+        ),
+        torch.ones(8, 1, dtype=torch.float64),
     )
-    in_rows = soft_memberships(values.view(2, 4), torch.tensor(centres, dtype=torch.float64))
+    in_rows = soft_memberships(
+        values.view(2, 4),
+        torch.tensor(centres, dtype=torch.float64),
+    )
     found = in_rows.flatten(0, 1)
     assert_allclose(found, expected, atol=1e-14)
 
 
 def test_hats_are_differentiable_in_both_arguments():
-    values = torch.tensor([0.0, 0.2, 0.37, 0.5, 2.0], dtype=torch.float64, requires_grad=True)
+    values = torch.tensor(
+        [0.0, 0.2, 0.37, 0.5, 2.0],
+        dtype=torch.float64,
+        requires_grad=True,
+    )
     centres = torch.tensor([0.1, 0.35, 0.9], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(soft_memberships, (values, centres))
 
@@ -65,10 +79,19 @@ def test_hard_classes_are_those_of_the_nearest_centre(axis):
 @pytest.mark.parametrize("depths", [[0.1, 0.35, 0.4, 0.95], [0.4]])
 def test_members_are_memberships_without_their_zeros(options, depths):
     axis = Attribute("depth", depths, **options)
-    values = torch.tensor([[0.0, 0.1, 0.3, 0.35], [0.5, 0.9, 1.0, torch.nan]])
+    values = torch.tensor(
+        [
+            [0.0, 0.1, 0.3, 0.35],
+            [0.5, 0.9, 1.0, torch.nan],
+        ]
+    )
     mask = values.isfinite()
     classes, weights = axis.members(values, mask)
-    found = torch.zeros(2, 4, len(depths)).scatter_add(2, classes, weights.detach())
+    found = torch.zeros(2, 4, len(depths)).scatter_add(
+        2,
+        classes,
+        weights.detach(),
+    )
     expected = axis.memberships(values[mask]).detach()
     torch.testing.assert_close(found[mask], expected)
     with pytest.raises(ValueError, match="Attribute: expected finite values, got NaN or infinity"):
@@ -89,7 +112,10 @@ def test_learned_hard_classes_are_hard_and_have_the_derivative_of_soft_ones():
     axes = {soft: Potential(3, 0.9, soft=soft, learnable=True) for soft in (False, True)}
     values = torch.linspace(0, 1.2, 30, requires_grad=True)
     upstream = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(axes[False].memberships(values), Potential(3, 0.9).memberships(values))
+    assert torch.equal(
+        axes[False].memberships(values),
+        Potential(3, 0.9).memberships(values),
+    )
     found, expected = (
         torch.autograd.grad(
             (axis.memberships(values) * upstream).sum(), [values, *axis.parameters()]
@@ -109,7 +135,11 @@ def test_values_of_points():
             potential[i, :n], embedded(two_bodies(), i, n_eigenpairs=4).norm(dim=1), rtol=1e-5
         )
     assert torch.equal(
-        Attribute("depth", [0.1, 0.2]).values(seen, nn.Identity()), seen.samples.attributes["depth"]
+        Attribute("depth", [0.1, 0.2]).values(
+            seen,
+            nn.Identity(),
+        ),
+        seen.samples.attributes["depth"],
     )
 
 
@@ -165,7 +195,11 @@ def test_named_axes_are_made_as_they_are_by_default():
     found = {name: type(axis_of(name)) for name in AXES}
     assert found == dict(AXES)
     assert isinstance(axis_of("interior_distance"), PairAxis)
-    assert_allclose(axis_of("potential").centres(), np.arange(4) * 0.375 + 0.1875, rtol=1e-6)
+    assert_allclose(
+        axis_of("potential").centres(),
+        np.arange(4) * 0.375 + 0.1875,
+        rtol=1e-6,
+    )
 
 
 def test_a_wrong_name_lists_the_axes():

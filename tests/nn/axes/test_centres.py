@@ -12,7 +12,10 @@ def test_interval_centres_lie_in_the_middle_of_equal_intervals():
     )
 
 
-@pytest.mark.parametrize(("n", "largest"), [(0, 1.0), (3, 0.0), (3, float("inf"))])
+@pytest.mark.parametrize(
+    ("n", "largest"),
+    [(0, 1.0), (3, 0.0), (3, float("inf"))],
+)
 def test_impossible_intervals_are_refused(n, largest):
     expected = (
         "n_bins: expected at least 1, got 0"
@@ -23,7 +26,10 @@ def test_impossible_intervals_are_refused(n, largest):
         interval_centres(n, largest, "n_bins")
 
 
-@pytest.mark.parametrize("start", [[0.1, 0.2, 0.5, 0.6], [-3.0, -1.0, 0.0, 7.0], [0.4]])
+@pytest.mark.parametrize(
+    "start",
+    [[0.1, 0.2, 0.5, 0.6], [-3.0, -1.0, 0.0, 7.0], [0.4]],
+)
 def test_learned_centres_stay_in_order(start):
     centres = OrderedCentres(start, learnable=True)
     assert centres.log_gap is not None
@@ -46,7 +52,10 @@ def test_fixed_centres_are_a_copy_and_no_parameters():
     assert list(centres.parameters()) == []
 
 
-@pytest.mark.parametrize("start", [[0.1, 0.1], [], [0.1, float("nan")], [[0.1, 0.2]]])
+@pytest.mark.parametrize(
+    "start",
+    [[0.1, 0.1], [], [0.1, float("nan")], [[0.1, 0.2]]],
+)
 def test_centres_that_do_not_ascend_are_refused(start):
     with pytest.raises(ValueError, match="start: expected finite values in ascending order"):
         OrderedCentres(start)

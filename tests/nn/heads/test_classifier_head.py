@@ -61,7 +61,10 @@ def test_the_temperature_is_the_likeliest_on_what_is_held_out():
 
     def loss(temperature):
         return float(
-            log_loss(truth, (torch.cat(scores).double() / temperature).softmax(dim=1).numpy())
+            log_loss(
+                truth,
+                (torch.cat(scores).double() / temperature).softmax(dim=1).numpy(),
+            )
         )
 
     found = float(head.calibration)
@@ -98,7 +101,11 @@ def test_strangeness_is_what_its_formula_says():
 def test_a_class_that_was_left_out_is_unknown_and_others_are_not():
     histograms, labels = drawn(6, 12, noise=0.3)
     known = labels < 15
-    head = ClassifierHead(names=list("abcde")).fit(histograms[known], labels[known], PARTS)
+    head = ClassifierHead(names=list("abcde")).fit(
+        histograms[known],
+        labels[known],
+        PARTS,
+    )
     new, classes = drawn(6, 12, noise=0.3, seed=1)
     unknown = head.strangeness(new) > head.strange_from
     assert bool(unknown[classes == 15].all())

@@ -59,7 +59,12 @@ def test_few_directions_are_the_largest(collection):
     few = WhitenedHead(n_directions=3).fit(histograms, labels)
     many = WhitenedHead(n_directions=40).fit(histograms, labels)
     assert_close(few.gains, many.gains[:, :3])
-    assert_close((few.directions @ many.directions[:3].T).abs(), torch.eye(3), atol=1e-4, rtol=0)
+    assert_close(
+        (few.directions @ many.directions[:3].T).abs(),
+        torch.eye(3),
+        atol=1e-4,
+        rtol=0,
+    )
 
 
 def test_parts_are_whitened_one_by_one(collection):
@@ -132,9 +137,17 @@ def test_kernel_head_is_kernel_ridge_regression(collection):
 
 def test_identical_shapes_have_no_direction():
     histograms = torch.tensor(
-        [[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.0, 0.25, 0.75], [0.0, 0.25, 0.75]]
+        [
+            [0.5, 0.5, 0.0],
+            [0.5, 0.5, 0.0],
+            [0.0, 0.25, 0.75],
+            [0.0, 0.25, 0.75],
+        ]
     )
-    head = WhitenedHead().fit(histograms, torch.tensor([0, 0, 1, 1]))
+    head = WhitenedHead().fit(
+        histograms,
+        torch.tensor([0, 0, 1, 1]),
+    )
     centred = histograms.sqrt() - histograms.sqrt().mean(dim=0)
     assert_close(head(histograms), normalize(centred))
 
@@ -150,7 +163,11 @@ def test_state_round_trips_into_a_head_of_other_sizes(collection, kind):
     histograms, labels = collection
     head = kind().fit(histograms, labels, (20, 40))
     state = {name: value.clone() for name, value in head.state_dict().items()}
-    few = kind(n_directions=5).fit(histograms[::2, :9], labels[::2] % 3, (4, 3, 2))
+    few = kind(n_directions=5).fit(
+        histograms[::2, :9],
+        labels[::2] % 3,
+        (4, 3, 2),
+    )
     for copy in (kind(), kind(n_directions=5), few):
         copy.load_state_dict(state)
         assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
@@ -198,7 +215,11 @@ def test_errors_name_the_argument(collection):
 def prior(collection):
     """Fitted to the last four classes, in two parts."""
     histograms, labels = collection
-    return WhitenedHead().fit(histograms[labels >= 4], labels[labels >= 4], (20, 40))
+    return WhitenedHead().fit(
+        histograms[labels >= 4],
+        labels[labels >= 4],
+        (20, 40),
+    )
 
 
 class SquaredPrior(WhitenedHead):
@@ -220,7 +241,11 @@ def squared(prior):
 def test_a_prior_stays_as_it_is(collection, prior, kind):
     histograms, labels = collection
     before = {name: value.clone() for name, value in prior.state_dict().items()}
-    head = kind(prior=prior).fit(histograms[labels < 4], labels[labels < 4], (30, 30))
+    head = kind(prior=prior).fit(
+        histograms[labels < 4],
+        labels[labels < 4],
+        (30, 30),
+    )
     for name, value in prior.state_dict().items():
         assert_close(value, before[name], rtol=0, atol=0)
     found = head(histograms).norm(dim=1)
@@ -265,7 +290,12 @@ def test_whitened_distance_is_the_weighted_mean_with_the_priors(collection, prio
         head = WhitenedHead(prior=given, prior_share=0.3).fit(histograms, labels)
         beside = head(histograms)
         found = head.distances(beside, beside[:9])
-        assert_close(found, (0.7 * cosine(own, own) + 0.3 * of_prior)[:, :9], atol=1e-6, rtol=0)
+        assert_close(
+            found,
+            (0.7 * cosine(own, own) + 0.3 * of_prior)[:, :9],
+            atol=1e-6,
+            rtol=0,
+        )
         whole = 0.7 * cosine(own, own) + 0.3 * cosine(other, other)
         assert_close(cosine(beside, beside), whole, atol=1e-6, rtol=0)
     with pytest.raises(RuntimeError, match="WhitenedHead: expected to be fitted first"):
@@ -344,7 +374,13 @@ def test_the_priors_kernel_is_one_more(collection, prior, squared, power):
     test = slice(1, 48, 2)
     kernels = []
     parts = histograms.split([20, 40], dim=1)
-    heads = [WhitenedHead().fit(part[train], labels[train])(part) for part in parts]
+    heads = [
+        WhitenedHead().fit(
+            part[train],
+            labels[train],
+        )(part)
+        for part in parts
+    ]
     for vectors, exponent in (*((one, 1) for one in heads), (prior(histograms), power)):
         distances = (1 - (vectors @ vectors[train].T).double().numpy()) ** exponent
         kernels.append(np.exp(-distances / np.median(distances[train][np.triu_indices(24, 1)])))
@@ -353,8 +389,16 @@ def test_the_priors_kernel_is_one_more(collection, prior, squared, power):
         kernel[train], np.eye(8)[labels[train]]
     )
     given = prior if power == 1 else squared
-    head = KernelHead(given, prior_share=0.25).fit(histograms[train], labels[train], (20, 40))
-    assert_allclose(head.scores(histograms[test]), oracle.predict(kernel[test]), atol=2e-3)
+    head = KernelHead(given, prior_share=0.25).fit(
+        histograms[train],
+        labels[train],
+        (20, 40),
+    )
+    assert_allclose(
+        head.scores(histograms[test]),
+        oracle.predict(kernel[test]),
+        atol=2e-3,
+    )
 
 
 def test_one_shape_of_each_class_leaves_the_prior_alone(collection, prior):
@@ -363,14 +407,20 @@ def test_one_shape_of_each_class_leaves_the_prior_alone(collection, prior):
     distances = 1 - vectors @ vectors[::6].T
     few = distances[::6][np.triu_indices(8, 1)]
     kernel = np.exp(-distances / np.sort(few)[(len(few) - 1) // 2])
-    oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(kernel[::6], np.eye(8))
+    oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(
+        kernel[::6],
+        np.eye(8),
+    )
     head = KernelHead(prior).fit(histograms[::6], labels[::6])
     found = head.scores(histograms)
     expected = oracle.predict(kernel)
     assert_allclose(found, expected, atol=2e-3)
 
 
-@pytest.mark.parametrize(("n_of_each", "temperature"), [(3, 0.2), (6, 0.1), (24, 0.1)])
+@pytest.mark.parametrize(
+    ("n_of_each", "temperature"),
+    [(3, 0.2), (6, 0.1), (24, 0.1)],
+)
 def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(
     collection, n_of_each, temperature
 ):
@@ -386,20 +436,31 @@ def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(
     expected = 1 - (about @ about.T + likely @ likely.T) / 2
     vectors = head(histograms)
     assert_allclose(cosine(vectors, vectors), expected, atol=1e-5)
-    hard = KernelHead(temperature=1e-6).fit(histograms[::2], labels[::2])
+    hard = KernelHead(temperature=1e-6).fit(
+        histograms[::2],
+        labels[::2],
+    )
     assert torch.isfinite(hard(histograms)).all()  # as no exponential overflows
 
 
 def fitted_heads(collection):
     """All heads that are fitted in closed form, by themselves and with a prior."""
     body_heads = [WCCNHead([part], lengths=True) for part in range(2)]
-    prior = TwoLevelHead(WCCNHead([0]), body_heads, scales=(0.1, 0.2), exponents=(0.3, 0.7))
+    prior = TwoLevelHead(
+        WCCNHead([0]),
+        body_heads,
+        scales=(0.1, 0.2),
+        exponents=(0.3, 0.7),
+    )
     prior.fit(*collection, [20, 40])
     priors = (None, prior)
     made = [
         head(prior=one) for head in (WhitenedHead, KernelHead, ClassifierHead) for one in priors
     ]
-    return [prior, *(head.fit(*collection, [20, 40]) for head in made)]
+    return [
+        prior,
+        *(head.fit(*collection, [20, 40]) for head in made),
+    ]
 
 
 def test_fitted_heads_are_traced_whole_and_take_half_precision(collection):

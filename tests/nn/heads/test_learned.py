@@ -123,7 +123,12 @@ def test_the_head_alone_is_what_a_descriptor_under_it_deploys(histograms, make):
     pairs = torch.triu_indices(12, 12, 1).unbind()
     unit = deployed.distances(vectors, vectors)[pairs].median()
     assert unit > 0
-    assert_close(distance(histograms[:5], histograms), expected / unit, atol=1e-5, rtol=1e-4)
+    assert_close(
+        distance(histograms[:5], histograms),
+        expected / unit,
+        atol=1e-5,
+        rtol=1e-4,
+    )
 
 
 def test_without_head_it_is_the_paper(histograms):

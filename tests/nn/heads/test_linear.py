@@ -15,7 +15,10 @@ def rows(n_classes):
     cells = torch.rand(60, 20, generator=generator)
     numbers = torch.randn(60, 4, generator=generator)
     numbers[:, 0] += 2 * labels
-    return torch.cat([cells / cells.sum(dim=1, keepdim=True), numbers], dim=1), labels + 5
+    return torch.cat(
+        [cells / cells.sum(dim=1, keepdim=True), numbers],
+        dim=1,
+    ), labels + 5
 
 
 @pytest.mark.parametrize("n_classes", [2, 3])
@@ -36,7 +39,11 @@ def test_only_named_parts_are_used_and_the_state_is_kept(parts, tmp_path):
     x, y = rows(3)
     head = LinearHead(parts=parts, n_numbers=3).fit(x, y)
     changed = x.clone()
-    columns = {"form": slice(0, 20), "numbers": slice(20, 23), "size": slice(23, 24)}
+    columns = {
+        "form": slice(0, 20),
+        "numbers": slice(20, 23),
+        "size": slice(23, 24),
+    }
     for part, place in columns.items():
         if part not in parts:
             changed[:, place] = 7.0

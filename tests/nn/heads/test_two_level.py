@@ -45,7 +45,10 @@ def projected(histograms, bodies, shrinkage):
     whitening = np.real(sqrtm(shrinkage * np.linalg.inv(shrinkage * np.eye(N_CELLS) + relative)))
     centred = roots - roots.mean(axis=0)
     # The training roots span all 40 dimensions, so the head only subtracts their mean
-    _, _, axes = np.linalg.svd((means - roots.mean(axis=0)) @ whitening, full_matrices=False)
+    _, _, axes = np.linalg.svd(
+        (means - roots.mean(axis=0)) @ whitening,
+        full_matrices=False,
+    )
     return centred @ whitening @ axes[:10].T
 
 
@@ -70,7 +73,11 @@ def test_parts_have_equal_shares_and_others_do_not_count(collection):
     assert found.shape == (len(histograms), 12 + 10)
     assert_close(cosine(found, found), expected, atol=2e-4, rtol=0)
     changed = histograms.clone()
-    changed[:, 12:30] = torch.rand(len(changed), 18, generator=torch.Generator().manual_seed(1))
+    changed[:, 12:30] = torch.rand(
+        len(changed),
+        18,
+        generator=torch.Generator().manual_seed(1),
+    )
     assert_close(head(changed), found, atol=1e-6, rtol=0)
 
 
@@ -78,13 +85,24 @@ def test_with_lengths_distances_are_those_of_mahalanobis(collection):
     """Against SciPy's `sqrtm`, up to one common factor; the last number makes the length of the vector 1."""
     histograms, _, bodies = collection
     expected = torch.from_numpy(projected(histograms, bodies, 0.2))
-    head = WCCNHead(n_directions=10, shrinkage=0.2, lengths=True).fit(histograms.double(), bodies)
+    head = WCCNHead(n_directions=10, shrinkage=0.2, lengths=True).fit(
+        histograms.double(),
+        bodies,
+    )
     found = head(histograms.double())
     assert found.shape == (len(histograms), 11)
-    assert_close(found.norm(dim=1), torch.ones(len(found), dtype=torch.float64))
+    assert_close(
+        found.norm(dim=1),
+        torch.ones(len(found), dtype=torch.float64),
+    )
     own = torch.pdist(found[:, :10])
     theirs = torch.pdist(expected)
-    assert_close(own / own.median(), theirs / theirs.median(), atol=1e-6, rtol=1e-6)
+    assert_close(
+        own / own.median(),
+        theirs / theirs.median(),
+        atol=1e-6,
+        rtol=1e-6,
+    )
     assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
 
 
@@ -98,15 +116,35 @@ def test_the_distance_is_what_the_formula_says(same_class, collection, monkeypat
         WCCNHead((0,), n_directions=6, lengths=True),
         WCCNHead((1,), n_directions=5, lengths=True),
     )
-    head = TwoLevelHead(class_head, body_heads, scales=(0.2, 0.3), exponents=(0.3, 0.7), share=0.3)
+    head = TwoLevelHead(
+        class_head,
+        body_heads,
+        scales=(0.2, 0.3),
+        exponents=(0.3, 0.7),
+        share=0.3,
+    )
     vectors = head.fit(histograms, classes, (15, 25), bodies=bodies)(histograms)
-    assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
+    assert_close(
+        vectors.norm(dim=1),
+        torch.ones(len(vectors)),
+        atol=1e-5,
+        rtol=0,
+    )
     x, y, z = (one(histograms).double() for one in (class_head, *body_heads))
     products = 0.7 * x @ x.T + 0.15 * y @ y.T + 0.15 * z @ z.T
     assert_close((vectors @ vectors.T).double(), products, atol=1e-5, rtol=0)
-    assert_close(head.within_class(vectors)[:, :7].double(), 0.15**0.5 * y, atol=1e-6, rtol=0)
+    assert_close(
+        head.within_class(vectors)[:, :7].double(),
+        0.15**0.5 * y,
+        atol=1e-6,
+        rtol=0,
+    )
     first, second = (
-        torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist")
+        torch.cdist(
+            one[:, :-1],
+            one[:, :-1],
+            compute_mode="donot_use_mm_for_euclid_dist",
+        )
         for one in (y, z)
     )
     apart = first**0.3 * second**0.7
@@ -148,15 +186,30 @@ def test_body_heads_can_have_shapes_of_their_own(collection):
     expected = 0.5**0.5 * torch.cat([of_class(histograms), of_body(histograms)], dim=1)
     assert_close(head(histograms), expected)
     # Of the shapes of classes
-    _, _, axes = np.linalg.svd(expected[:200].double().numpy(), full_matrices=False)
+    _, _, axes = np.linalg.svd(
+        expected[:200].double().numpy(),
+        full_matrices=False,
+    )
     short = head.shorten(head(histograms))
     projected = torch.from_numpy(expected.double().numpy() @ axes.T)
-    assert_close(cosine(short, short).double(), cosine(projected, projected), atol=1e-4, rtol=0)
+    assert_close(
+        cosine(short, short).double(),
+        cosine(projected, projected),
+        atol=1e-4,
+        rtol=0,
+    )
 
 
 def test_distances_of_equal_vectors_have_a_gradient(collection):
     histograms, classes, bodies = collection
-    body_heads = [WCCNHead((part,), n_directions=6, lengths=True) for part in range(2)]
+    body_heads = [
+        WCCNHead(
+            (part,),
+            n_directions=6,
+            lengths=True,
+        )
+        for part in range(2)
+    ]
     head = TwoLevelHead(body_heads=body_heads, scales=(0.1, 0.1), exponents=(0.2, 0.8))
     head.fit(histograms, classes, (15, 25), bodies=bodies)
     vectors = head(histograms[:4]).requires_grad_()
@@ -165,7 +218,11 @@ def test_distances_of_equal_vectors_have_a_gradient(collection):
     distances.sum().backward()
     assert vectors.grad is not None
     assert torch.isfinite(vectors.grad).all()
-    point = torch.zeros(1, vectors.shape[1]).index_fill_(1, torch.tensor([0]), 1.0)
+    point = torch.zeros(1, vectors.shape[1]).index_fill_(
+        1,
+        torch.tensor([0]),
+        1.0,
+    )
     _, slope = torch.func.jvp(
         lambda x: head.distances(x, point), (point,), (torch.ones_like(point),)
     )
@@ -220,7 +277,10 @@ def test_short_vectors_span_the_leading_singular_directions(collection, monkeypa
     monkeypatch.setattr("igps.nn.heads.two_level.MAX_SHORT_WIDTH", 7)
     found = head.fit(histograms, classes, bodies=bodies).shorten(vectors)
     assert found.shape == (len(vectors), 7)
-    _, _, axes = np.linalg.svd(vectors.double().numpy(), full_matrices=False)
+    _, _, axes = np.linalg.svd(
+        vectors.double().numpy(),
+        full_matrices=False,
+    )
     expected = vectors.double().numpy() @ axes[:7].T
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-4)
@@ -232,7 +292,10 @@ def test_it_is_stored_and_loaded(collection):
         WCCNHead((0,), 5), [WCCNHead((1,), 6, lengths=True)], scales=[0.3], share=0.3
     )
     fitted.fit(histograms, classes, (15, 25), bodies=bodies)
-    other = TwoLevelHead(WCCNHead((0,)), [WCCNHead((1,), lengths=True)])
+    other = TwoLevelHead(
+        WCCNHead((0,)),
+        [WCCNHead((1,), lengths=True)],
+    )
     other.load_state_dict(fitted.state_dict())
     assert_close(other(histograms), fitted(histograms))
     vectors = other(histograms)

@@ -129,13 +129,19 @@ CASES = {
             Potential(2, soft=True),
             EuclideanDistance(5),
         ],
-        lambda look: [look.depth(soft=True), look.potential(2, soft=True)],
+        lambda look: [
+            look.depth(soft=True),
+            look.potential(2, soft=True),
+        ],
         lambda look: [look.euclidean(5)],
     ),
     "interior × interior of another embedding": (
         lambda: [InteriorDistance(6), InteriorDistance(5, 2.0, embedding=COARSE)],
         lambda look: [],
-        lambda look: [look.interior(6), look.interior(5, 2.0, n=2)],
+        lambda look: [
+            look.interior(6),
+            look.interior(5, 2.0, n=2),
+        ],
     ),
     "soft potential × interior × interior × Euclidean": (
         lambda: [
@@ -145,7 +151,11 @@ CASES = {
             EuclideanDistance(2),
         ],
         lambda look: [look.potential(2, soft=True)],
-        lambda look: [look.interior(4), look.interior(3, n=2), look.euclidean(2)],
+        lambda look: [
+            look.interior(4),
+            look.interior(3, n=2),
+            look.euclidean(2),
+        ],
     ),
     "soft potential × depth × interior × cosines in the embedding": (
         lambda: [
@@ -208,7 +218,10 @@ def test_learned_axes_equal_brute_force_loop(batch, with_cosines):
     for i in range(2):
         look = Look(batch, i)
         memberships = product(
-            soft_classes(look.embedding().norm(dim=1), potential.centres().tolist()),
+            soft_classes(
+                look.embedding().norm(dim=1),
+                potential.centres().tolist(),
+            ),
             soft_classes(look.attribute("depth"), depth.centres().tolist()),
         )
         pairs = [(look.interior(2)[0], interior.centres().tolist())]
@@ -238,7 +251,11 @@ class DepthDifference(PairAxis):
         def between(rows, columns):
             return (rows[0][:, None, :, None] - columns[0][:, None, None, :]).abs()
 
-        return PairValues((features.attribute("depth"),), (torch.tensor([0.0, 0.1, 0.5]),), between)
+        return PairValues(
+            (features.attribute("depth"),),
+            (torch.tensor([0.0, 0.1, 0.5]),),
+            between,
+        )
 
 
 def test_an_axis_of_ones_own_counts_values_of_its_own(batch):
@@ -357,7 +374,14 @@ def test_padding_changes_neither_result_nor_gradient_of_the_samples(make, paddin
     batch = layer(batch_of(padded, mask, places, {"surface_direction": towards}))
     single = embedding[::3].clone().requires_grad_()
     attributes = {"surface_direction": directions[None, ::3]}
-    alone = layer(batch_of(single[None], None, points[None, ::3], attributes))
+    alone = layer(
+        batch_of(
+            single[None],
+            None,
+            points[None, ::3],
+            attributes,
+        )
+    )
     assert_close(batch[1], alone[0], rtol=0, atol=1e-14)
     (expected,) = grad(alone.square().sum(), single)
     (gradient,) = grad(batch[1].square().sum(), padded)
@@ -370,7 +394,10 @@ def test_gradient_through_classes_and_layout():
     """By learned centres and by the embedding, whose norm is the potential; against finite differences."""
     embedding = some(9, seed=2)[0].requires_grad_()
     layer = PairHistogram(
-        [Potential(3, soft=True, learnable=True), InteriorDistance(4, 2.0, learnable=True)]
+        [
+            Potential(3, soft=True, learnable=True),
+            InteriorDistance(4, 2.0, learnable=True),
+        ]
     ).double()
     names = ["axes.1.centres.log_gap", "axes.0.centres.log_gap"]
 
@@ -381,7 +408,13 @@ def test_gradient_through_classes_and_layout():
 
     generator = torch.Generator().manual_seed(3)
     parameters = [
-        torch.randn(n, generator=generator, dtype=torch.float64, requires_grad=True) for n in (4, 3)
+        torch.randn(
+            n,
+            generator=generator,
+            dtype=torch.float64,
+            requires_grad=True,
+        )
+        for n in (4, 3)
     ]
     leaves = (embedding, *parameters)
     for gradient in grad(histogram(*leaves).square().sum(), leaves):
@@ -400,7 +433,12 @@ def test_layout_survives_its_state():
     learn(layer)
     fresh.load_state_dict(layer.state_dict())
     embedding, points, _ = some(30)
-    batch = batch_of(embedding[None], None, points[None], {"depth": points[None, :, 0]})
+    batch = batch_of(
+        embedding[None],
+        None,
+        points[None],
+        {"depth": points[None, :, 0]},
+    )
     assert torch.equal(fresh(batch), layer(batch))
     assert not torch.equal(made(4.0)(batch), layer(batch))
 
@@ -417,7 +455,12 @@ def test_half_precision_and_autocast_count_in_single(device, cosines):
     def run(points):
         leaf = points.clone().requires_grad_()
         result = layer(batch_of(leaf[None]))
-        return result, list(grad(result.square().sum(), [leaf, *layer.parameters()]))
+        return result, list(
+            grad(
+                result.square().sum(),
+                [leaf, *layer.parameters()],
+            )
+        )
 
     expected, expected_gradients = run(embedding.float())
     with torch.autocast(device, torch.bfloat16):
@@ -425,7 +468,10 @@ def test_half_precision_and_autocast_count_in_single(device, cosines):
         hard = PairHistogram().to(device)(batch_of(embedding[None]))
     assert result.dtype == hard.dtype == torch.float32
     assert_close(result, expected, rtol=0, atol=1e-6)
-    assert_close(hard, PairHistogram().to(device)(batch_of(embedding.float()[None])))
+    assert_close(
+        hard,
+        PairHistogram().to(device)(batch_of(embedding.float()[None])),
+    )
     # What comes by way of the directions, on a GPU also of the potential, is rounded before it is summed, and partly
     # cancels.
     rounding = (
@@ -468,7 +514,12 @@ def test_bad_batch_is_refused(batch):
         match=r"expected the interior samples to have 'charge', got \['depth', 'surface_direction'\]",
     ):
         PairHistogram([Attribute("charge", [0.1, 0.2]), InteriorDistance()])(batch)
-    broken = batch_of(torch.rand(1, 5, 3), None, None, {"depth": torch.full((1, 5), torch.nan)})
+    broken = batch_of(
+        torch.rand(1, 5, 3),
+        None,
+        None,
+        {"depth": torch.full((1, 5), torch.nan)},
+    )
     with pytest.raises(ValueError, match="Attribute: expected finite values"):
         PairHistogram([Attribute("depth", [0.1, 0.2]), EuclideanDistance()])(broken)
     points = replace(batch.interior, points=batch.interior.points * torch.inf)

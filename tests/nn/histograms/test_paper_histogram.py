@@ -36,7 +36,10 @@ def cloud():
     return embedding, embedding.norm(dim=1)
 
 
-@pytest.mark.parametrize(("n_classes", "n_bins"), [(1, 64), (3, 7), (8, 2)])
+@pytest.mark.parametrize(
+    ("n_classes", "n_bins"),
+    [(1, 64), (3, 7), (8, 2)],
+)
 def test_equals_brute_force_loop(cloud, n_classes, n_bins):
     embedding, potential = cloud
     expected = by_loops(embedding.numpy(), potential.numpy(), 4.0, 1.5, n_classes, n_bins)
@@ -53,7 +56,14 @@ def test_values_beyond_the_ranges_stay_in_the_last_cells(cloud):
     embedding, potential = cloud
     far = pair_histogram(embedding * 100, potential * 100)
     assert far.sum() == pytest.approx(1)
-    expected = by_loops(embedding.numpy() * 100, potential.numpy() * 100, 4.0, 1.5, 4, 64)
+    expected = by_loops(
+        embedding.numpy() * 100,
+        potential.numpy() * 100,
+        4.0,
+        1.5,
+        4,
+        64,
+    )
     assert_allclose(far, expected, atol=1e-12)
     assert far[-1, -1] > 0.9
 
@@ -62,7 +72,12 @@ def test_does_not_depend_on_order_or_on_the_basis(cloud):
     embedding, potential = cloud
     order = torch.randperm(len(embedding), generator=torch.Generator().manual_seed(0))
     rotation = torch.linalg.qr(
-        torch.randn(6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        torch.randn(
+            6,
+            6,
+            dtype=torch.float64,
+            generator=torch.Generator().manual_seed(1),
+        )
     ).Q
     turned = pair_histogram(embedding[order] @ rotation, potential[order])
     assert_allclose(turned, pair_histogram(embedding, potential), atol=1e-10)

@@ -44,8 +44,14 @@ def test_it_is_the_share_of_samples_in_each_cell():
         memberships = product(
             soft_classes(radii[:, 0], inside),
             soft_classes(radii[:, 1], outside),
-            soft_classes(embedded(batch, i, "surface", 2).norm(dim=1), [0.25, 0.75, 1.25]),
-            soft_classes(embedded(batch, i, "surface", 5).norm(dim=1), [0.25, 0.75, 1.25, 1.75]),
+            soft_classes(
+                embedded(batch, i, "surface", 2).norm(dim=1),
+                [0.25, 0.75, 1.25],
+            ),
+            soft_classes(
+                embedded(batch, i, "surface", 5).norm(dim=1),
+                [0.25, 0.75, 1.25, 1.75],
+            ),
         )
         expected = memberships.mean(axis=0)
         np.testing.assert_allclose(found[i].flatten(), expected, atol=1e-6)
@@ -64,7 +70,12 @@ def test_padding_and_scale_change_nothing():
 
 def test_a_subset_of_the_samples_is_counted():
     batch = two_bodies()
-    expected = layout()(replace(batch, surface=batch.surface.subset(20, seed=0)))
+    expected = layout()(
+        replace(
+            batch,
+            surface=batch.surface.subset(20, seed=0),
+        )
+    )
     assert_close(layout(n_samples=20)(batch), expected)
 
 
@@ -94,7 +105,12 @@ def test_the_function_counts_memberships_by_masks_and_weights():
     one = random.random((2, 5, 3))
     other = random.random((2, 5, 2))
     weights = random.random((2, 5))
-    mask = np.array([[True] * 5, [True, True, False, True, False]])
+    mask = np.array(
+        [
+            [True] * 5,
+            [True, True, False, True, False],
+        ]
+    )
     expected = (
         np.einsum("npc,npd,np->ncd", one, other, mask * weights) / mask.sum(axis=1)[:, None, None]
     )
@@ -106,4 +122,7 @@ def test_the_function_counts_memberships_by_masks_and_weights():
     np.testing.assert_allclose(count(*given).detach(), expected)
     assert torch.autograd.gradcheck(count, given)
     with pytest.raises(ValueError, match="samples: expected at least one"):
-        functional.point_histogram([given[0]], torch.zeros(2, 5, dtype=torch.bool))
+        functional.point_histogram(
+            [given[0]],
+            torch.zeros(2, 5, dtype=torch.bool),
+        )

@@ -24,7 +24,13 @@ def on(mesh, n):
 def by_definition(points, directions, side):
     """Third smallest radius of balls tangent at x through another point that is not close to the tangent plane."""
     radii = []
-    for i, (x, n) in enumerate(zip(points.tolist(), directions.tolist(), strict=True)):
+    for i, (x, n) in enumerate(
+        zip(
+            points.tolist(),
+            directions.tolist(),
+            strict=True,
+        )
+    ):
         found = []
         for j, y in enumerate(points.tolist()):
             depth = side * sum(a * (b - c) for a, b, c in zip(n, x, y, strict=True))
@@ -54,7 +60,10 @@ def ball_radii(request):
 def test_radii_are_those_of_the_definition(ball_radii):
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(60, 3, generator=generator, dtype=torch.float64)
-    directions = normalize(torch.randn(60, 3, generator=generator, dtype=torch.float64), dim=1)
+    directions = normalize(
+        torch.randn(60, 3, generator=generator, dtype=torch.float64),
+        dim=1,
+    )
     found = ball_radii(points, directions)
     for side, column in ((1, 0), (-1, 1)):
         np.testing.assert_allclose(
@@ -76,7 +85,10 @@ def test_near_points_keep_their_digits_in_single_precision(ball_radii):
 
 
 def test_a_ball_has_its_own_radius_inside_and_none_outside(ball_radii):
-    points = normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    points = normalize(
+        torch.randn(500, 3, generator=torch.Generator().manual_seed(1)),
+        dim=1,
+    )
     radii = ball_radii(0.3 * points, points)
     found = radii[:, 0]
     expected = torch.full((500,), 0.3)
@@ -103,7 +115,10 @@ def test_two_plates_have_half_their_thickness_inside_and_half_their_gap_outside(
 
 def test_two_points_inside_a_ball_do_not_change_the_other_radii(ball_radii):
     """Closed form: 398 points of a unit sphere keep radius 1, although two noisy points lie at half the radius."""
-    points = normalize(torch.randn(400, 3, generator=torch.Generator().manual_seed(2)), dim=1)
+    points = normalize(
+        torch.randn(400, 3, generator=torch.Generator().manual_seed(2)),
+        dim=1,
+    )
     directions = points.clone()
     points[:2] *= 0.5
     radii = ball_radii(points, directions)[2:, 0]
@@ -151,5 +166,11 @@ def test_padding_does_not_change_radii(ball_radii):
             assert (found[1, 11:] == 1).all()
             for i, n in enumerate((30, 11)):
                 assert_close(
-                    found[i, :n], ball_radii(points[i, :n], directions[i, :n]), rtol=1e-3, atol=0
+                    found[i, :n],
+                    ball_radii(
+                        points[i, :n],
+                        directions[i, :n],
+                    ),
+                    rtol=1e-3,
+                    atol=0,
                 )

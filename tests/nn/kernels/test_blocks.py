@@ -47,7 +47,10 @@ def test_groups_are_padded_to_their_largest_body(copies, on_cpu, widths, request
 
 def test_a_batch_may_have_samples_of_one_kind_only():
     batch = bodies(1, 50)
-    batch = replace(batch, surface=batch.surface.map(lambda values: values[:, :0]))
+    batch = replace(
+        batch,
+        surface=batch.surface.map(lambda values: values[:, :0]),
+    )
     found = map_by_size(lambda group: group.area, batch).tolist()
     assert found == batch.area.tolist()
 
@@ -77,7 +80,12 @@ def test_bodies_of_all_sizes_are_described_and_learned_from_as_alone(several):
     for i in range(3):
         description, gradient = described(alone(batch, i))
         assert_close(descriptions[i], description[0], rtol=0, atol=1e-6)
-        assert_close(gradients[i, : gradient.shape[1]], gradient[0], rtol=1e-4, atol=1e-7)
+        assert_close(
+            gradients[i, : gradient.shape[1]],
+            gradient[0],
+            rtol=1e-4,
+            atol=1e-7,
+        )
         assert not gradients[i, gradient.shape[1] :].any()
 
 

@@ -97,14 +97,28 @@ KINDS = {
     ),
     "own": (
         lambda s: differences(s["heights"], centres(FEW, s["points"])),
-        lambda s: [(np.abs(np.subtract.outer(s["heights"].numpy(), s["heights"].numpy())), FEW)],
+        lambda s: [
+            (
+                np.abs(
+                    np.subtract.outer(
+                        s["heights"].numpy(),
+                        s["heights"].numpy(),
+                    )
+                ),
+                FEW,
+            )
+        ],
     ),
     "cosines": (
         lambda s: oriented_pairs(
             s["points"], s["directions"], centres(TOWARDS, s["points"]), centres(AMONG, s["points"])
         ),
         lambda s: list(
-            zip(cosines(s["points"], s["directions"]), (TOWARDS, TOWARDS, AMONG), strict=True)
+            zip(
+                cosines(s["points"], s["directions"]),
+                (TOWARDS, TOWARDS, AMONG),
+                strict=True,
+            )
         ),
     ),
     "twists": (
@@ -119,7 +133,10 @@ KINDS = {
         ),
         lambda s: [
             (v, AMONG)
-            for v in cosines(s["coordinates"], normalize(s["coordinates"].roll(1, 0), dim=1))
+            for v in cosines(
+                s["coordinates"],
+                normalize(s["coordinates"].roll(1, 0), dim=1),
+            )
         ],
     ),
 }
@@ -158,7 +175,10 @@ def test_histogram_is_the_sum_of_hats_over_all_pairs(device, layout, n_classes, 
     expected = pair_histogram_by_loops(given["memberships"], axes)
     assert_allclose(result, expected, atol=1e-12)
     assert float(result.sum()) == pytest.approx(1, abs=1e-12)
-    single = counted(layout, {name: value.float().to(device) for name, value in given.items()})
+    single = counted(
+        layout,
+        {name: value.float().to(device) for name, value in given.items()},
+    )
     assert single.dtype == torch.float32
     assert_allclose(single.cpu(), result, atol=1e-6)
 
@@ -184,7 +204,10 @@ def test_any_spacing_of_centres_is_exact(device, layout):
 def test_single_precision_is_summed_in_double(device):
     """Half a million pairs whose weights are not whole: in single precision the sum would be off by some 10⁻⁴."""
     given = {name: value.to(device) for name, value in some(1000).items()}
-    result = counted(["many"], {name: value.float() for name, value in given.items()})
+    result = counted(
+        ["many"],
+        {name: value.float() for name, value in given.items()},
+    )
     assert float(result.sum()) == pytest.approx(1, abs=1e-6)
     expected = counted(["many"], given).cpu()
     assert_allclose(result.cpu(), expected, atol=1e-7)
@@ -206,13 +229,19 @@ def test_whole_pairs_of_single_precision_are_as_those_of_double(layout):
     assert_allclose(result, expected, atol=1e-7)
 
 
-@pytest.mark.parametrize(("spread", "bin_of_all"), [(0.0, 0), (1e4, 4)])
+@pytest.mark.parametrize(
+    ("spread", "bin_of_all"),
+    [(0.0, 0), (1e4, 4)],
+)
 def test_a_block_of_pairs_that_all_fall_into_one_bin(spread, bin_of_all):
     """The largest number of pairs that one integer counts, with the largest share of a pair and with share 0."""
     points = torch.arange(1.0, 2401.0)[:, None] * spread
     expected = one_hot(torch.tensor([bin_of_all]), 5).float()
     assert torch.equal(
-        joint_histogram(torch.ones(2400, 1), [euclidean_distances(points, torch.tensor(EQUAL))]),
+        joint_histogram(
+            torch.ones(2400, 1),
+            [euclidean_distances(points, torch.tensor(EQUAL))],
+        ),
         expected,
     )
 
@@ -221,7 +250,10 @@ def test_pairs_that_are_not_counted_take_no_products():
     """Of 1,000 points 499,500 pairs are counted, of 4 flops each in two dimensions."""
     points = torch.randn(1000, 2, generator=torch.Generator().manual_seed(3))
     with FlopCounterMode(display=False) as counter:
-        joint_histogram(torch.ones(1000, 1), [euclidean_distances(points, torch.tensor(EQUAL))])
+        joint_histogram(
+            torch.ones(1000, 1),
+            [euclidean_distances(points, torch.tensor(EQUAL))],
+        )
     assert 499_500 * 4 <= counter.get_total_flops() < 1.15 * 499_500 * 4
 
 
@@ -250,7 +282,11 @@ def test_points_that_coincide_have_no_line(device):
 
 def test_a_reflection_turns_the_order_of_twists(device):
     given = {name: values.to(device) for name, values in some().items()}
-    mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64, device=device)
+    mirror = torch.tensor(
+        [1.0, -1.0, 1.0],
+        dtype=torch.float64,
+        device=device,
+    )
     mirrored = {
         **given,
         "points": given["points"] * mirror,
@@ -271,7 +307,10 @@ def test_turning_moving_and_reordering_change_nothing(device, layout):
     moved = {name: value[order] for name, value in given.items()}
     moved |= {"points": moved["points"] @ turn + 4, "directions": moved["directions"] @ turn}
     expected, found, inwards = (
-        counted(layout, {name: value.to(device) for name, value in one.items()})
+        counted(
+            layout,
+            {name: value.to(device) for name, value in one.items()},
+        )
         for one in (given, moved, {**given, "directions": -given["directions"]})
     )
     assert_close(found, expected, atol=1e-9, rtol=0)
@@ -284,7 +323,12 @@ def test_no_cell_is_negative(device, joint):
     generator = torch.Generator().manual_seed(0)
     layout = ((torch.arange(12) + 0.5) / 3).to(device)
     below = torch.nextafter(layout[1:].cpu(), torch.zeros(())).repeat(20)
-    length = torch.cat([below, below * (1 - 6e-8 * torch.rand(len(below), generator=generator))])
+    length = torch.cat(
+        [
+            below,
+            below * (1 - 6e-8 * torch.rand(len(below), generator=generator)),
+        ]
+    )
     ends = torch.zeros(len(length), 2, 3)
     ends[:, 1] = length[:, None] * normalize(
         torch.randn(len(length), 3, generator=generator), dim=1
@@ -306,7 +350,10 @@ def test_no_cell_of_cosines_is_negative(device):
     below = torch.logspace(-6, -3, 40)[:, None]
     angle = torch.linspace(0.1, 3.0, 20).expand(40, -1)
     both = torch.stack([angle, angle + torch.acos(0.4 - below)], dim=2).flatten(0, 1)
-    directions = torch.stack([both.cos(), both.sin(), torch.zeros_like(both)], dim=2)
+    directions = torch.stack(
+        [both.cos(), both.sin(), torch.zeros_like(both)],
+        dim=2,
+    )
     points = torch.zeros(800, 2, 3)
     points[:, 1, 0] = (0.75 - below).expand(-1, 20).flatten()
     angles = (torch.arange(5) * 0.4 - 0.8).to(device)
@@ -322,7 +369,11 @@ def test_shapes_of_any_sizes_are_counted_as_alone(device):
     sizes = [5, 40, 2, 38, 12, 13, 40]
     shapes = [{name: value.to(device) for name, value in some(n, seed=n).items()} for n in sizes]
     padded = {
-        name: pad_sequence([one[name] for one in shapes], batch_first=True, padding_value=torch.nan)
+        name: pad_sequence(
+            [one[name] for one in shapes],
+            batch_first=True,
+            padding_value=torch.nan,
+        )
         for name in shapes[0]
     }
     mask = torch.arange(40, device=device) < torch.tensor(sizes, device=device)[:, None]
@@ -361,13 +412,22 @@ def test_threads_change_no_bit(many_cores):
 
 def dense(memberships, values, layouts):
     """The definition over all pairs at once, (pairs,) values of each axis, for its gradients."""
-    i, j = torch.triu_indices(len(memberships), len(memberships), 1, device=memberships.device)
+    i, j = torch.triu_indices(
+        len(memberships),
+        len(memberships),
+        1,
+        device=memberships.device,
+    )
     shares = None
     for value, layout in zip(values, layouts, strict=True):
         passed = ((value[:, None] - layout[:-1]) / layout.diff()).clamp(0, 1)
         ones = torch.ones_like(passed[:, :1])
         share = torch.cat([ones, passed], dim=1) - torch.cat([passed, 0 * ones], dim=1)
-        share = share.view(len(i), *[1] * (0 if shares is None else shares.ndim - 1), -1)
+        share = share.view(
+            len(i),
+            *[1] * (0 if shares is None else shares.ndim - 1),
+            -1,
+        )
         shares = share if shares is None else shares.unsqueeze(-1) * share
     rows = []
     for a, b in combinations_with_replacement(range(memberships.shape[1]), 2):
@@ -390,7 +450,10 @@ def test_gradients_equal_those_of_the_dense_definition(device, layout, block):
         if "cosines" in kind:
             points, directions = one.inputs
             line = normalize(points[j] - points[i], dim=1)
-            ends = [(directions[i] * line).sum(dim=1), -(directions[j] * line).sum(dim=1)]
+            ends = [
+                (directions[i] * line).sum(dim=1),
+                -(directions[j] * line).sum(dim=1),
+            ]
             values += [
                 torch.maximum(*ends),
                 torch.minimum(*ends),
@@ -398,7 +461,10 @@ def test_gradients_equal_those_of_the_dense_definition(device, layout, block):
             ]
         elif kind == "twists":
             way = one.inputs[0][j] - one.inputs[0][i]
-            turned = torch.linalg.cross(one.inputs[1][i], one.inputs[1][j])
+            turned = torch.linalg.cross(
+                one.inputs[1][i],
+                one.inputs[1][j],
+            )
             values.append((turned * way).sum(dim=1) / way.norm(dim=1))
         elif kind == "own":
             values.append((one.inputs[0][i] - one.inputs[0][j]).abs())
@@ -429,9 +495,19 @@ def test_gradcheck(device, layout):
     leaves = [given[name].to(device).requires_grad_() for name in names]
 
     def histogram(logits, *others):
-        moved = dict(zip(names, (logits.softmax(dim=1), *others), strict=True))
+        moved = dict(
+            zip(
+                names,
+                (logits.softmax(dim=1), *others),
+                strict=True,
+            )
+        )
         return counted(
-            layout, {**{name: value.to(device) for name, value in given.items()}, **moved}
+            layout,
+            {
+                **{name: value.to(device) for name, value in given.items()},
+                **moved,
+            },
         )
 
     for gradient in grad(histogram(*leaves).square().sum(), leaves):
@@ -449,7 +525,12 @@ def test_gradients_taken_under_autocast_keep_their_digits(layout):
     [expected] = grad(counted(layout, given).square().sum(), leaves)
     with torch.autocast("cpu", torch.bfloat16):
         [found] = grad(counted(layout, given).square().sum(), leaves)
-    assert_close(found, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))
+    assert_close(
+        found,
+        expected,
+        rtol=1e-5,
+        atol=1e-6 * float(expected.abs().max()),
+    )
 
 
 def test_coincident_points_have_finite_gradients(device):
@@ -500,13 +581,23 @@ def test_bad_points_are_refused(change, message):
         counted(["few", "many"], {**good, **change})
 
 
-@pytest.mark.parametrize("layout", [[0.5, 0.5, 1.0], [0.5, torch.inf], [torch.nan, 1.0], [1.0], []])
+@pytest.mark.parametrize(
+    "layout",
+    [[0.5, 0.5, 1.0], [0.5, torch.inf], [torch.nan, 1.0], [1.0], []],
+)
 def test_bad_centres_are_refused(layout):
     points = torch.rand(5, 3)
     bins = torch.tensor(layout)
     for pairs in (
         [euclidean_distances(points, bins)],
-        [oriented_pairs(points, points, bins, torch.rand(2).sort()[0])],
+        [
+            oriented_pairs(
+                points,
+                points,
+                bins,
+                torch.rand(2).sort()[0],
+            )
+        ],
     ):
         with pytest.raises(
             ValueError, match="centres: expected two or more finite, ascending values"
@@ -528,5 +619,8 @@ def test_directions_are_of_the_shape_of_the_points():
 
 def test_far_points_are_counted_as_long_as_their_distances_can_be_squared():
     far = torch.tensor([[-1e18, 0.0], [1e18, 0.0]])
-    result = joint_histogram(torch.ones(2, 1), [euclidean_distances(far, torch.tensor([0.5, 1.0]))])
+    result = joint_histogram(
+        torch.ones(2, 1),
+        [euclidean_distances(far, torch.tensor([0.5, 1.0]))],
+    )
     assert result.tolist() == [[0, 1]]
