@@ -25,7 +25,11 @@ ORACLES = {
 @pytest.fixture(params=["loops", "tiles"])
 def either_device(request, monkeypatch):
     """The distances of the processor's memory, by compiled loops, and those of a device, by PyTorch's tiles."""
-    monkeypatch.setattr(distances, "_uses_loops", lambda a, b: request.param == "loops")
+    monkeypatch.setattr(
+        distances,
+        "_uses_loops",
+        lambda a, b: request.param == "loops",
+    )
 
 
 def histograms(n, cells, *, seed, filled=0.6):
@@ -45,7 +49,10 @@ def histograms(n, cells, *, seed, filled=0.6):
 @pytest.mark.parametrize("distance", ALL)
 @pytest.mark.parametrize(
     ("dtype", "tolerance"),
-    [(torch.float64, 1e-12), (torch.float32, 4e-6)],
+    [
+        (torch.float64, 1e-12),
+        (torch.float32, 4e-6),
+    ],
 )
 @pytest.mark.parametrize(
     ("n_queries", "n_gallery", "cells"),
@@ -278,7 +285,11 @@ def test_gradients_are_finite_at_empty_cells_and_at_distance_zero(distance):
     assert torch.isfinite(shapes.grad).all()
     assert torch.equal(
         shapes.grad[:, empty],
-        torch.zeros(6, int(empty.sum()), dtype=torch.float64),
+        torch.zeros(
+            6,
+            int(empty.sum()),
+            dtype=torch.float64,
+        ),
     )
 
 

@@ -32,7 +32,11 @@ def random_case(*, n, n_classes, seed, ties=False):
     )
     if ties:
         distances = (distances * 5).floor()
-    labels = torch.randint(n_classes, (n,), generator=generator)
+    labels = torch.randint(
+        n_classes,
+        (n,),
+        generator=generator,
+    )
     return distances, labels
 
 
@@ -161,7 +165,13 @@ def test_agrees_with_loops_over_ranks(n, n_classes, ties):
     scores = retrieval_scores(distances, labels)
     assert scores.n_queries == n
     for query in range(n):
-        expected = scores_by_loops(ranked_relevance(distances, labels.tolist(), query))
+        expected = scores_by_loops(
+            ranked_relevance(
+                distances,
+                labels.tolist(),
+                query,
+            )
+        )
         found = {name: getattr(scores, name)[query].item() for name in expected}
         assert found == pytest.approx(expected, abs=1e-12)
 
@@ -334,7 +344,11 @@ def test_a_recall_level_that_is_a_number_of_hits_is_not_rounded_up():
 def test_metric_over_batches_is_the_function_over_all():
     generator = torch.Generator().manual_seed(11)
     descriptors = torch.rand(30, 2, 8, generator=generator)
-    labels = torch.randint(3, (30,), generator=generator)
+    labels = torch.randint(
+        3,
+        (30,),
+        generator=generator,
+    )
     metric = RetrievalScoresMetric(euclidean)
     for start in range(0, 30, 7):
         metric.update(
@@ -384,7 +398,11 @@ def _score_part(process, folder):
     metric = RetrievalScoresMetric(euclidean)
     for chosen in (part[:3], part[3:]):
         ids = [f"shape {i}" for i in chosen]
-        metric.update(descriptors[chosen], labels[chosen], ids)
+        metric.update(
+            descriptors[chosen],
+            labels[chosen],
+            ids,
+        )
     torch.save(metric.compute(), f"{folder}/scores-{process}.pt")
     torch.distributed.destroy_process_group()
 

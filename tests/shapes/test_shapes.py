@@ -29,6 +29,14 @@ def all_shapes(default_shapes):
     return default_shapes + [shapes[i] for i in range(8, 12)]
 
 
+def surface_of(shape):
+    return trimesh.Trimesh(
+        shape.vertices,
+        shape.faces,
+        process=False,
+    )
+
+
 def directed_edges(faces):
     return [(int(f[i]), int(f[(i + 1) % 3])) for f in faces for i in range(3)]
 
@@ -45,7 +53,9 @@ def test_the_faces_at_each_vertex_form_one_fan(all_shapes):
     for shape in all_shapes:
         after = [{} for _ in shape.vertices]
         for a, b, c in shape.faces.tolist():
-            after[a][b], after[b][c], after[c][a] = c, a, b
+            after[a][b] = c
+            after[b][c] = a
+            after[c][a] = b
         for fan in after:
             start = next(iter(fan))
             around = [start]
@@ -56,11 +66,7 @@ def test_the_faces_at_each_vertex_form_one_fan(all_shapes):
 
 def test_one_component_of_the_recorded_genus(all_shapes):
     for shape in all_shapes:
-        surface = trimesh.Trimesh(
-            shape.vertices,
-            shape.faces,
-            process=False,
-        )
+        surface = surface_of(shape)
         assert surface.body_count == 1, shape.name
         assert surface.euler_number == 2 - 2 * shape.genus, shape.name
 
@@ -78,11 +84,7 @@ def test_arrays_and_triangles_are_sane(all_shapes):
         found = len(np.unique(shape.vertices, axis=0))
         assert found == len(shape.vertices)
         assert 1800 <= len(shape.vertices) <= 4200, shape.name
-        surface = trimesh.Trimesh(
-            shape.vertices,
-            shape.faces,
-            process=False,
-        )
+        surface = surface_of(shape)
         assert surface.volume > 0.05, shape.name
         angles = surface.face_angles
         assert np.degrees(angles.min()) > 5.0, shape.name
@@ -95,7 +97,10 @@ def test_same_seed_same_arrays_other_seed_others(default_shapes):
         assert_array_equal(again.vertices, default_shapes[i].vertices)
         assert_array_equal(again.faces, default_shapes[i].faces)
     other = ArticulatedShapes(n_per_class=3, seed=1)[0]
-    assert not np.array_equal(other.vertices, default_shapes[0].vertices)
+    assert not np.array_equal(
+        other.vertices,
+        default_shapes[0].vertices,
+    )
 
 
 def test_a_shape_does_not_depend_on_the_others(all_shapes):
@@ -112,11 +117,7 @@ def test_shapes_of_a_class_differ(default_shapes):
     for start in range(0, 24, 3):
         compactness = []
         for shape in default_shapes[start : start + 3]:
-            surface = trimesh.Trimesh(
-                shape.vertices,
-                shape.faces,
-                process=False,
-            )
+            surface = surface_of(shape)
             compactness.append(surface.volume / surface.area**1.5)
         assert np.ptp(compactness) > 1e-3 * np.mean(compactness), default_shapes[start].name
 
@@ -129,14 +130,13 @@ def test_resolution_follows_n_vertices():
 
 def distance_histogram(shape):
     """D2 (Osada, Funkhouser, Chazelle and Dobkin 2002): distances of random surface points, over the area's root."""
-    mesh = trimesh.Trimesh(
-        shape.vertices,
-        shape.faces,
-        process=False,
-    )
+    mesh = surface_of(shape)
     points, _ = trimesh.sample.sample_surface(mesh, 800, seed=0)
-    distances = np.linalg.norm(points[:400, None] - points[None, 400:], axis=2) / np.sqrt(mesh.area)
-    return np.histogram(distances, 32, (0.0, 1.6))[0] / distances.size
+    apart = points[:400, None] - points[None, 400:]
+    distances = np.linalg.norm(apart, axis=2)
+    distances /= np.sqrt(mesh.area)
+    counts, _ = np.histogram(distances, 32, (0.0, 1.6))
+    return counts / distances.size
 
 
 def test_shapes_of_a_class_are_closer_than_others(default_shapes):
@@ -207,7 +207,9 @@ POINTS = np.random.default_rng(0).uniform(
 
 
 def nearest_sphere(centres, radii):
-    return (np.linalg.norm(POINTS[:, None] - centres[None], axis=2) - radii).min(axis=1)
+    to_centres = POINTS[:, None] - centres[None]
+    distances = np.linalg.norm(to_centres, axis=2)
+    return (distances - radii).min(axis=1)
 
 
 def swept(solid):
@@ -219,17 +221,16 @@ def swept(solid):
             line = np.column_stack([zero, zero, t * length])
             return nearest_sphere(line, start + t * (end - start))
         case Arc(bend, angle, start, end):
-            line = np.column_stack(
-                [
-                    zero,
-                    bend * (1 - np.cos(t * angle)),
-                    bend * np.sin(t * angle),
-                ]
-            )
-            return nearest_sphere(line, start + t * (end - start))
+            turn = t * angle
+            height = bend * (1 - np.cos(turn))
+            length = bend * np.sin(turn)
+            line = np.column_stack([zero, height, length])
+            radii = start + t * (end - start)
+            return nearest_sphere(line, radii)
         case Ring(radius, tube, side):
-            x = radius * np.cos(2 * np.pi * t)
-            z = radius * np.sin(2 * np.pi * t)
+            turn = 2 * np.pi * t
+            x = radius * np.cos(turn)
+            z = radius * np.sin(turn)
             bows = np.column_stack([x, zero, z + np.sign(z) * side])
             right = np.column_stack([zero + radius, zero, (2 * t - 1) * side])
             left = right * [-1, 1, 1]
@@ -258,7 +259,10 @@ def test_distance_to_swept_solids(solid):
 
 @pytest.mark.parametrize(
     "solid",
-    [Box((1.0, 0.6, 1.6), 0.1), Prism(4, 0.9, 0.5, 0.05)],
+    [
+        Box((1.0, 0.6, 1.6), 0.1),
+        Prism(4, 0.9, 0.5, 0.05),
+    ],
 )
 def test_flat_solids_have_their_volume(solid):
     """Of a box and of a square prism, by counting points; the rounding takes off little."""

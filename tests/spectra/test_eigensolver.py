@@ -47,7 +47,10 @@ def assert_pairs(spectrum, problem, tolerance=1e-07):
     assert np.abs(mass @ functions).max() < 1e-9 * np.sqrt(mass.sum())
 
 
-@pytest.mark.parametrize("n_eigenpairs", [1, 100, 280])
+@pytest.mark.parametrize(
+    "n_eigenpairs",
+    [1, 100, 280],
+)
 def test_agrees_with_a_dense_solver(n_eigenpairs, torus_problem, torus_oracle):
     stiffness, mass, positions = torus_problem
     spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions)
@@ -78,7 +81,9 @@ def copies_of_a_patch(n_copies, side):
         [np.ones(side - 1), np.ones(side - 1)],
         offsets=[-1, 1],
     )
-    grid = sparse.kron(path, sparse.eye_array(side)) + sparse.kron(sparse.eye_array(side), path)
+    identity = sparse.eye_array(side)
+    grid = sparse.kron(path, identity)
+    grid += sparse.kron(identity, path)
     copies = sparse.coo_array(
         sparse.kron(
             sparse.eye_array(n_copies),
@@ -87,14 +92,18 @@ def copies_of_a_patch(n_copies, side):
     )
     tips = 1 + side**2 * np.arange(n_copies)
     hub = np.zeros_like(tips)
-    rows = np.r_[copies.coords[0] + 1, hub, tips]
-    columns = np.r_[copies.coords[1] + 1, tips, hub]
+    sources, targets = copies.coords
+    rows = np.r_[sources + 1, hub, tips]
+    columns = np.r_[targets + 1, tips, hub]
     n_vertices = 1 + n_copies * side**2
     adjacency = sparse.csr_array(
         (np.ones(len(rows)), (rows, columns)), shape=(n_vertices, n_vertices)
     )
-    stiffness = sparse.csr_array(sparse.diags_array(adjacency.sum(axis=1)) - adjacency)
-    return stiffness, np.linspace(1, 1, n_vertices), np.zeros((n_vertices, 3))
+    degrees = sparse.diags_array(adjacency.sum(axis=1))
+    stiffness = sparse.csr_array(degrees - adjacency)
+    mass = np.ones(n_vertices)
+    positions = np.zeros((n_vertices, 3))
+    return stiffness, mass, positions
 
 
 def test_multiplets_larger_than_the_block():
@@ -102,7 +111,11 @@ def test_multiplets_larger_than_the_block():
     values = np.linalg.eigvalsh(problem[0].toarray())
     assert np.ptp(values[1:40]) < 1e-12 < 1e-3 < values[40] - values[39]
     for n_eigenpairs in (38, 39, 60, 100):
-        spectrum = eigenpairs(problem[0], problem[1], n_eigenpairs)
+        spectrum = eigenpairs(
+            problem[0],
+            problem[1],
+            n_eigenpairs,
+        )
         expected = values[1 : n_eigenpairs + 1]
         assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
         assert_pairs(spectrum, problem)
@@ -165,7 +178,10 @@ def test_scale_of_the_coordinates(scale, torus_problem):
     )
     found = other.eigenvalues * scale**2
     assert_allclose(found, one.eigenvalues, rtol=1e-10)
-    assert_pairs(other, (stiffness, mass * scale**2, positions))
+    assert_pairs(
+        other,
+        (stiffness, mass * scale**2, positions),
+    )
 
 
 def test_same_seed_same_bits_other_seed_same_space(torus_problem):
@@ -189,7 +205,12 @@ def test_positions_change_only_the_work(torus_problem):
 def test_tiny_meshes(n_vertices):
     tetrahedron = trimesh.Trimesh(
         np.eye(4)[:, :3],
-        [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]],
+        [
+            [0, 1, 2],
+            [0, 3, 1],
+            [1, 3, 2],
+            [2, 3, 0],
+        ],
     )
     problem = cotangent_problem(tetrahedron if n_vertices == 4 else trimesh.creation.icosahedron())
     spectrum = eigenpairs(*problem[:2], n_vertices - 2)
@@ -306,7 +327,12 @@ def test_the_residual_is_that_of_the_worst_pair(n_eigenpairs, torus_problem):
 def test_mass_may_be_a_diagonal_matrix(pack, torus_problem):
     stiffness, mass, positions = torus_problem
     of_vector = eigenpairs(stiffness, mass, 20, positions=positions)
-    of_matrix = eigenpairs(stiffness, pack(mass), 20, positions=positions)
+    of_matrix = eigenpairs(
+        stiffness,
+        pack(mass),
+        20,
+        positions=positions,
+    )
     assert_array_equal(of_matrix.eigenfunctions, of_vector.eigenfunctions)
     assert_array_equal(of_matrix.mass, mass)
 
@@ -418,7 +444,12 @@ def test_what_is_refused(torus_problem):
     with pytest.raises(ValueError, match=r"expected \(V, V\) and \(V,\), got"):
         eigenpairs(stiffness, mass[1:], 5)
     with pytest.raises(ValueError, match="positions"):
-        eigenpairs(stiffness, mass, 5, positions=positions[1:])
+        eigenpairs(
+            stiffness,
+            mass,
+            5,
+            positions=positions[1:],
+        )
     with pytest.raises(ValueError, match="Pass -stiffness"):
         eigenpairs(-stiffness, mass, 5)
     with pytest.raises(ValueError, match=r"not diagonal\. Lump it"):
