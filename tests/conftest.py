@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.signature import mean_value as coordinates
+from page_packages import install
 
 # The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
 torch.set_num_threads(1)
@@ -61,7 +62,26 @@ def without_loops(monkeypatch):
 @pytest.fixture
 def trust_recent_files(monkeypatch):
     """Tests cannot set the time of the last change of a file's metadata (ctime)."""
-    monkeypatch.setattr("igps.data.known_files.MIN_AGE", 0)
+    for module in ("data.known_files", "gallery.rows"):
+        monkeypatch.setattr(f"igps.{module}.MIN_AGE", 0)
+
+
+@pytest.fixture
+def nothing_is_computed(monkeypatch):
+    """Fail where signatures are computed."""
+
+    def precompute(*arguments, **options):
+        pytest.fail("signatures are computed")
+
+    monkeypatch.setattr("igps.data.dataset.SignatureDataset.precompute", precompute)
+
+
+@pytest.fixture
+def own_commands(on_path):
+    """The commands of `own_commands`, as an installed package brings them."""
+    names = "".join(f'{name} = "own_commands:{name}"\n' for name in ("wait", "ask", "pose"))
+    project = '[project]\nname = "own"\nversion = "1"\n'
+    install(f'{project}[project.entry-points."igps.commands"]\n{names}', on_path)
 
 
 @pytest.fixture

@@ -1,5 +1,7 @@
 """Maps keep what distances a plane can keep; clusters are those that were put in, and chance ones are told unstable."""
 
+import os
+import subprocess
 import sys
 
 import numpy as np
@@ -67,10 +69,23 @@ def test_alike_bodies_lie_in_one_point(n):
     assert found.stress == 0
 
 
-def test_umap_puts_clusters_apart():
+UMAP = """
+from sys import argv
+import numpy as np
+from igps.analysis.map import body_map
+np.save(argv[2], body_map(np.load(argv[1]), "umap").points)
+"""
+
+
+def test_umap_puts_clusters_apart(tmp_path):
+    """In a process in which nothing is compiled, which would take longer than thirty points."""
     pytest.importorskip("umap", reason="umap-learn is not installed")
     points = blobs(15, [[0, 0, 0], [9, 0, 0]], 0.5)
-    found = body_map(cdist(points, points), "umap").points
+    np.save(tmp_path / "distances.npy", cdist(points, points))
+    command = [sys.executable, "-c", UMAP, "distances.npy", "map.npy"]
+    uncompiled = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run(command, check=True, cwd=tmp_path, env=uncompiled)
+    found = np.load(tmp_path / "map.npy")
     assert cdist(found[:15], found[:15]).max() < cdist(found[:15], found[15:]).min()
 
 

@@ -498,8 +498,7 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(root, tmp_path, capsys):
         logging.disable(logging.NOTSET)
 
 
-def test_an_interruption_is_told_in_a_line(monkeypatch, capsys):
-    monkeypatch.setitem(COMMANDS, "wait", "own_commands:wait")
+def test_an_interruption_is_told_in_a_line(own_commands, capsys):
     with pytest.raises(SystemExit, match="130"):
         run("wait")
     assert (
@@ -508,8 +507,7 @@ def test_an_interruption_is_told_in_a_line(monkeypatch, capsys):
     )
 
 
-def test_what_takes_more_memory_than_there_is_is_told_in_a_line(monkeypatch, capsys):
-    monkeypatch.setitem(COMMANDS, "ask", "own_commands:ask")
+def test_what_takes_more_memory_than_there_is_is_told_in_a_line(own_commands, capsys):
     with pytest.raises(SystemExit, match="2"):
         run("ask")
     assert re.fullmatch(
@@ -622,6 +620,7 @@ def test_json_of_two_bodies_and_of_copies(root, tmp_path, capsys):
 WRITING = [name for name in COMMANDS if "out" in get_type_hints(load_command(name).function)]
 
 
+@pytest.mark.usefixtures("nothing_is_computed")
 @pytest.mark.parametrize("command", WRITING)
 def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
     command, root, tmp_path, monkeypatch, capsys
@@ -639,9 +638,6 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
             run(*given, "--out", place)
         return capsys.readouterr().err.splitlines()[-1]
 
-    monkeypatch.setattr(
-        SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
-    )
     (tmp_path / "file").touch()
     assert told(tmp_path / "file" / name) == (
         f"igps: out: expected a folder, {tmp_path / 'file'} is a file. Choose another path."
@@ -732,25 +728,20 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
     ],
 )
 def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
-    words, told, root, tmp_path, here, monkeypatch, capsys
+    words, told, root, tmp_path, here, nothing_is_computed, monkeypatch, capsys
 ):
     descriptor("d2").save("plain.safetensors", {})
     shutil.copytree(root / "egg", tmp_path / "TWO")
     (tmp_path / "TWO" / "2.off").unlink()
     places = {"ROOT": str(root), "BALL": str(root / "ball" / "0.off")}
     monkeypatch.setitem(sys.modules, "umap", None)
-    monkeypatch.setattr(
-        SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
-    )
     with pytest.raises(SystemExit, match="1"):
         run(*(places.get(word, word) for word in words))
     assert capsys.readouterr().err.startswith(f"igps: {told.replace('ROOT', str(root))}")
 
 
-def test_a_list_of_failures_is_no_folder(root, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(
-        SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
-    )
+@pytest.mark.usefixtures("nothing_is_computed")
+def test_a_list_of_failures_is_no_folder(root, tmp_path, capsys):
     with pytest.raises(SystemExit, match="1"):
         run("precompute", root, "--failures", tmp_path)
     assert (

@@ -184,10 +184,7 @@ def test_a_repeated_list_is_collected_in_place_of_its_default(command: str) -> N
     assert options["with"] == ["a", "b=2"]
 
 
-def test_a_function_is_a_command(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(COMMANDS, "pose", "own_commands:pose")  # type: ignore[misc]
+def test_a_function_is_a_command(own_commands, capsys):
     run("pose", "a.off", "--classes", "1", "2", "--exact")
     run("pose", "a.off", "--length", "3")
     assert capsys.readouterr().out.splitlines() == ["a.off [1, 2] True 2.0", "a.off None False 3.0"]

@@ -188,9 +188,8 @@ def test_what_no_file_can_hold_is_refused_before_anything_is_computed(tmp_path, 
 
 @pytest.mark.parametrize("goal", ["known", "new"])
 def test_too_few_classes_are_told_before_anything_is_computed(
-    goal, root, tmp_path, monkeypatch, capsys
+    goal, root, tmp_path, nothing_is_computed, capsys
 ):
-    monkeypatch.setattr(library.SignatureDataset, "precompute", None)  # nothing is computed
     folder = tmp_path / "few"
     n_classes = 2 if goal == "new" else 1
     classes = [path for path in sorted((root / "eggs").iterdir()) if path.is_dir()]

@@ -374,11 +374,10 @@ def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_
     ],
 )
 def test_a_name_that_contradicts_an_option_is_refused_before_anything_is_computed(
-    command, name, options, tmp_path, here, monkeypatch
+    command, name, options, tmp_path, here, nothing_is_computed
 ):
     write_3mf(tmp_path / "balls" / "1" / "a.3mf", 1, "inch")
     igps.descriptor("d2+size").save(tmp_path / "kept.safetensors", {})
-    monkeypatch.setattr(igps.SignatureDataset, "precompute", None)
     root = tmp_path / "balls"
     run = {
         "retrieve": partial(retrieve, root, name),

@@ -378,12 +378,11 @@ def test_commands_that_change_a_gallery(root, tmp_path, capsys):
     assert len(lines(*query, "--exact", *cache)) == 1 + 3
 
 
-def test_sync_notices_a_table_of_names_that_was_edited(tmp_path, monkeypatch):
+def test_sync_notices_a_table_of_names_that_was_edited(tmp_path, trust_recent_files):
     """With its two names swapped the rows have the same names, and the bodies of each other."""
     save_labels(tmp_path / "scans" / "scan.nii.gz", block_and_bar())
     table = tmp_path / "names.json"
     table.write_text('{"1": "block", "2": "bar"}')
-    monkeypatch.setattr(rows, "MIN_AGE", 0)
 
     def now():
         reading = LoadOptions(bodies="labels", names=str(table))
@@ -573,11 +572,8 @@ def test_what_labels_tell_no_more_sync_empties(root, tmp_path):
 
 
 def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
-    root, tmp_path, monkeypatch, capsys
+    root, tmp_path, nothing_is_computed, capsys
 ):
-    monkeypatch.setattr(
-        SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed")
-    )
     words = ["gallery", "build", root, "--descriptor", INTERIOR]
     told = error_of(capsys, *words, "--out", root)
     assert "expected a gallery or a new folder, got a folder with ball" in told
