@@ -8,35 +8,25 @@ import trimesh
 from scipy.spatial.distance import mahalanobis
 
 from conftest import as_mesh
-from igps.analysis.dissimilarity import local_shape, squared_deviations
+from igps.analysis.dissimilarity import REQUIREMENTS, local_shape, squared_deviations
 from igps.data.collation import collate
 from igps.signature.signature import SignatureConfig, compute_signature
 
 RADIUS, HALF_LENGTH = 1.0, 1.6
-NORMALS = {
-    "estimated normals": (),
-    "given normals": ("surface_direction",),
-}
 
 
-@pytest.fixture(params=NORMALS.values(), ids=NORMALS)
-def attributes(request):
-    return request.param
-
-
-def spheroid(attributes, subdivisions, n_samples):
+def spheroid(subdivisions, n_samples):
     """Return the signature of a spheroid along the z axis."""
     body = trimesh.creation.icosphere(subdivisions=subdivisions)
     body.vertices *= [RADIUS, RADIUS, HALF_LENGTH]
-    config = SignatureConfig(
-        n_eigenpairs=10, resolution=16, n_surface_samples=n_samples, attributes=attributes
-    )
+    config = SignatureConfig(n_eigenpairs=10, resolution=16, n_surface_samples=n_samples)
+    config = REQUIREMENTS.apply_to(config)
     return compute_signature(as_mesh(body), config)
 
 
-def test_curvatures_and_thickness_of_a_spheroid(attributes):
+def test_curvatures_and_thickness_of_a_spheroid():
     """A ball inside that touches at a point is centred on the axis, where the normal meets it."""
-    body = spheroid(attributes, subdivisions=5, n_samples=6000)
+    body = spheroid(subdivisions=5, n_samples=6000)
     measured = local_shape(collate([body]))
     x, y, z = body.surface.points.T
     slant = np.sqrt((x**2 + y**2) / RADIUS**4 + z**2 / HALF_LENGTH**4)
@@ -47,19 +37,18 @@ def test_curvatures_and_thickness_of_a_spheroid(attributes):
     errors = measured[:, :2] / exact - 1
     assert np.sqrt(np.square(errors).mean(axis=0)).max() < 0.06
     assert np.abs(errors.mean(axis=0)).max() < 0.02
-    if attributes:
-        found = measured[:, :2].mean(axis=1)
-        expected = pytest.approx(exact.mean(axis=1), rel=0.1)
-        assert found == expected
+    found = measured[:, :2].mean(axis=1)
+    expected = pytest.approx(exact.mean(axis=1), rel=0.1)
+    assert found == expected
     # Normals of flat faces
     found = np.exp(measured[:, 2]) * unit * of_circles
     expected = pytest.approx(1, rel=0.25)
     assert found == expected
 
 
-def test_a_rough_surface_is_no_thinner(attributes):
+def test_a_rough_surface_is_no_thinner():
     """Neighbours a little below the tangent plane make no ball small."""
-    body = spheroid(attributes, subdivisions=4, n_samples=2000)
+    body = spheroid(subdivisions=4, n_samples=2000)
     points = body.surface.points
     step = 0.001 * np.sqrt(body.area) * np.random.default_rng(0).normal(size=points.shape)
     rough = replace(body, surface=replace(body.surface, points=points + step))

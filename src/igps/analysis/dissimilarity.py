@@ -8,7 +8,11 @@ from scipy.spatial.distance import cdist
 
 from igps._arrays import Floats, Integers
 from igps.data.batch import SampleBatch, SignatureBatch
+from igps.data.requirements import Requirements
 from igps.mesh.surface import unit
+
+REQUIREMENTS = Requirements(attributes=("surface_direction",))
+"""What bodies must have beside samples: outward normals."""
 
 # Times of the heat kernel over the area. The kernel of large times identifies the place on the body, the kernel of
 # small times depends on the surface around it
@@ -21,8 +25,7 @@ _MIN_DEVIATION = 0.1
 _SMOOTHING = 0.06  # standard deviation of the smoothing kernel
 _PATCH = 0.04  # radius of the patches of surface whose curvature is measured
 _MAX_BALL = 0.5  # largest radius of a ball
-_N_PLANE = 12  # nearest surface samples that determine a tangent plane
-_N_INSIDE = 6  # nearest interior samples that determine its side
+_MIN_PATCH = 12  # samples of a patch at least
 # A ball may contain samples that are nearer to its touching point than _NEAR, or whose direction from there has a
 # smaller sine to the tangent plane than _MIN_SINE
 _NEAR = 0.03
@@ -116,21 +119,13 @@ def local_shape(body: SignatureBatch) -> Floats:
     """Return (P, 3): the principal curvatures at each surface sample, and the log of the largest ball inside there.
 
     The curvatures, ascending and over the radius of a patch, are those of the linear function of the position that fits
-    the normals of the patch (least squares). Normals are outward, and estimated if the samples have none.
+    the normals of the patch (least squares). The body meets `REQUIREMENTS`.
     """
     points = _points(body.surface, body)
-    directions = body.surface.attributes.get("surface_direction")
-    if directions is None:
-        normals = _estimated_normals(points, _points(body.interior, body))
-    else:
-        normals = unit(directions[0][body.surface.mask[0]].double().numpy())
-    axes = _tangents(normals)
-    fits = _fitted_normals(points, normals, axes)
-    slopes = fits[:, 1:]
+    directions = body.surface.attributes["surface_direction"]
+    normals = unit(directions[0][body.surface.mask[0]].double().numpy())
+    slopes = _slopes_of_normals(points, normals)
     curvatures = np.linalg.eigvalsh((slopes + slopes.transpose(0, 2, 1)) / 2)
-    if directions is None:
-        corrections = axes @ fits[:, 0, :, None]
-        normals = unit(normals + corrections[:, :, 0])
     radii = _inner_balls(points, normals)
     return np.column_stack([curvatures, np.log(radii)])
 
@@ -143,14 +138,15 @@ def _tangents(normals: Floats) -> Floats:
     return np.stack([first, second], axis=2)
 
 
-def _fitted_normals(points: Floats, normals: Floats, axes: Floats) -> Floats:
-    """Return the linear functions that fit the normals of the patch around each point by least squares.
+def _slopes_of_normals(points: Floats, normals: Floats) -> Floats:
+    """Fit the normals of the patch around each point by a linear function of the position, by least squares.
 
     Returns:
-        (P, 3, 2) for both tangents the value at the point and the slopes along both tangents, over _PATCH.
+        (P, 2, 2) its slopes along two tangents, over _PATCH, of the parts of the normal along both.
     """
+    axes = _tangents(normals)
     # A disc of this radius has a share π r² of all samples; the curved surface, and another one near it, have more
-    n_patch = max(_N_PLANE, math.ceil(1.5 * math.pi * _PATCH**2 * len(points)))
+    n_patch = max(_MIN_PATCH, math.ceil(1.5 * math.pi * _PATCH**2 * len(points)))
     distances, patch = cKDTree(points).query(points, _ranks(n_patch, len(points)))
     weights = np.clip(1 - np.square(distances / _PATCH), 0, 1)
     cosines = np.einsum("pkc,pc->pk", normals[patch], normals)
@@ -160,20 +156,8 @@ def _fitted_normals(points: Floats, normals: Floats, axes: Floats) -> Floats:
     terms = np.concatenate([ones, steps], axis=2)
     weighted = (terms * weights[:, :, None]).transpose(0, 2, 1)
     matrix = weighted @ terms + 1e-3 * np.eye(3)  # solvable if all weights but one are 0
-    return np.linalg.solve(matrix, weighted @ (normals[patch] @ axes))
-
-
-def _estimated_normals(points: Floats, inside: Floats) -> Floats:
-    """Return outward normals (P, 3) of planes through the nearest points, by the nearest samples of the interior."""
-    _, plane = cKDTree(points).query(points, _ranks(_N_PLANE, len(points)))
-    offsets = points[plane] - points[plane].mean(axis=1, keepdims=True)
-    scatter = offsets.transpose(0, 2, 1) @ offsets
-    normals = np.linalg.eigh(scatter).eigenvectors[:, :, 0]
-    _, deep = cKDTree(inside).query(points, _ranks(_N_INSIDE, len(inside)))
-    outward = points - inside[deep].mean(axis=1)
-    is_inward = (outward * normals).sum(axis=1) < 0
-    signs = np.where(is_inward, -1, 1)
-    return signs[:, None] * normals
+    fits = np.linalg.solve(matrix, weighted @ (normals[patch] @ axes))
+    return fits[:, 1:]
 
 
 def _inner_balls(points: Floats, normals: Floats) -> Floats:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from igps._arrays import Floats
-from igps.analysis.dissimilarity import dissimilarity
+from igps.analysis.dissimilarity import REQUIREMENTS, dissimilarity
 from igps.analysis.superposition import Movement
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.data.collation import collate
@@ -81,7 +81,7 @@ def explain(
     Args:
         descriptor: histograms, such as interior or rich, or histograms under a head, such as pretrained; with or
             without side and size.
-        one, other: batches of one body each.
+        one, other: batches of one body each; without weights, with the attribute "surface_direction".
         weights: (P,) of the surface samples of both bodies, not negative, for `places`.
 
     Raises:
@@ -92,7 +92,8 @@ def explain(
             f"one, other: expected batches of one body, got {len(one)} and {len(other)} bodies."
         )
     for batch in (one, other):
-        Requirements().check(batch)  # samples of the surface show how far places differ
+        # Samples of the surface, and their normals, show how far places differ
+        (REQUIREMENTS if weights is None else Requirements()).check(batch)
     descriptor = copy.deepcopy(descriptor).double().eval()
     headless = without_head(descriptor)
     pair = (_with_weights(one), _with_weights(other))

@@ -64,17 +64,7 @@ def body_map(distances: Floats, layout: Layout = "mds", *, seed: int = 0) -> Bod
     """
     check_one_of(get_args(Layout), layout=layout)
     square = checked_distances(distances)
-    points = _classical_mds(square) if layout == "mds" else _umap(square, seed)
-    if (
-        layout == "mds"
-        and (n_iterations := min(_MAX_ITERATIONS, _MAX_ENTRIES // square.size))
-        and square.any()
-    ):
-        from sklearn.manifold import smacof
-
-        points = smacof(
-            square, init=points, n_init=1, max_iter=n_iterations, eps=1e-6, normalized_stress=False
-        )[0]
+    points = _metric_mds(square) if layout == "mds" else _umap(square, seed)
     centred = points - points.mean(axis=0)
     rotated = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
     rotated *= np.where((rotated**3).sum(axis=0) < 0, -1, 1)
@@ -92,6 +82,17 @@ def ends_of_axis(distances: Floats, axis: int) -> tuple[tuple[int, int], float]:
     # The mean square of a distance is twice the variance
     share = 2 * float(along.var() / np.square(checked_distances(distances)).mean())
     return (int(along.argmin()), int(along.argmax())), share
+
+
+def _metric_mds(distances: Floats) -> Floats:
+    points = _classical_mds(distances)
+    n_iterations = min(_MAX_ITERATIONS, _MAX_ENTRIES // distances.size)
+    if n_iterations == 0 or not distances.any():
+        return points
+    from sklearn.manifold import smacof
+
+    options = {"n_init": 1, "max_iter": n_iterations, "eps": 1e-6, "normalized_stress": False}
+    return smacof(distances, init=points, **options)[0]
 
 
 def _classical_mds(distances: Floats) -> Floats:
@@ -118,9 +119,8 @@ def import_umap() -> Any:
 
 def _umap(distances: Floats, seed: int) -> Floats:
     UMAP = import_umap()
-    with (
-        warnings.catch_warnings()
-    ):  # UMAP warns that a fit to precomputed distances cannot transform new points
+    # UMAP warns that a fit to precomputed distances cannot transform new points
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         umap = UMAP(
             n_neighbors=min(15, len(distances) - 1),

@@ -128,55 +128,63 @@ def outliers(
     codes = np.array([known_kinds.index(kind) for kind in kinds])
     own, other, nearest = _class_distances(np.asarray(distances, dtype=float), codes, names)
     n_per_subject = max_bodies_of_subject(subjects or range(len(codes)), codes)
-    scores = {
-        "shape": np.fmax(
-            *(
-                deviations_of(shape, codes, "shape", n_per_subject)[0]
-                for shape in (own, own - other)
-            )
-        )
-    }
+    by_distance, usual = deviations_of(own, codes, "shape", n_per_subject)
+    by_margin, _ = deviations_of(own - other, codes, "shape", n_per_subject)
+    judged = [_Measure("shape", np.fmax(by_distance, by_margin), own, usual)]
     values = dict(measures or {})
     if "overlap" in values:
         values["overlap"] = np.sqrt(values["overlap"].max(axis=1))
+    rare_notes: list[list[str]] = [[] for _ in labels]
     if notes is not None:
         values["repairs"], rare_notes = _rare_repairs(notes)
         if "stray" in values:  # defects of labels are measured in voxels instead
             values["repairs"][np.isfinite(values["stray"])] = 0
-    usual: dict[str, Floats] = {}
-    for name, measure in values.items():
-        scores[name], usual[name] = deviations_of(measure, codes, name, n_per_subject)
+    for name, measured in values.items():
+        scores, usual = deviations_of(measured, codes, name, n_per_subject)
+        judged.append(_Measure(name, scores, measured, usual))
     result = []
     for i, label in enumerate(labels):
-        deviations = {
-            name: float(np.nan_to_num(column[i], nan=0.0)) for name, column in scores.items()
-        }
-        score = float(np.linalg.norm(np.maximum(list(deviations.values()), 0)))
-        among = str(names[nearest[i]]) if own[i] > other[i] else None
+        scores_of_body = {one.name: float(np.nan_to_num(one.scores[i])) for one in judged}
+        score = float(np.linalg.norm(np.maximum(list(scores_of_body.values()), 0)))
         reasons = []
-        ordered = sorted(deviations, key=lambda name: -deviations[name])
-        for name in [name for k, name in enumerate(ordered) if k == 0 or deviations[name] > LIMIT]:
-            value, centre = (
-                float(table[name][i]) if name in table else 0.0 for table in (values, usual)
-            )
-            notes_text = "; ".join(rare_notes[i]) if name == "repairs" else ""
-            numbers = {"value": value, "usual": centre, "square": value**2, "common": centre**2}
-            reasons.append(
-                _REASONS[name].format(
-                    **numbers, ratio=np.exp(min(value - centre, 50)), notes=notes_text
-                )
-            )
-        if score <= LIMIT:
-            reasons = []
-        if among is not None:
+        if score > LIMIT:
+            first, *others = sorted(judged, key=lambda one: -scores_of_body[one.name])
+            telling = [first, *(one for one in others if scores_of_body[one.name] > LIMIT)]
+            reasons = [one.reason(i, rare_notes[i]) for one in telling]
+        among = None
+        if own[i] > other[i]:
+            among = str(names[nearest[i]])
             reasons.append(f"labelled {label}, but nearer to {among}")
         if not reasons:
             reasons = ["nothing unusual"]
             if np.isnan(own[i]):
                 place = f" cut at {sides[i]} by the border of the image" if sides[i] else ""
                 reasons = [f"shape not assessed: the only body of its class{place}"]
-        result.append(Outlier(i, label, score, deviations, among, "; ".join(reasons)))
+        result.append(Outlier(i, label, score, scores_of_body, among, "; ".join(reasons)))
     return sorted(result, key=lambda outlier: -outlier.score)
+
+
+@dataclass(frozen=True, eq=False)
+class _Measure:
+    """A measure of N bodies beside what is usual for their classes."""
+
+    name: str
+    scores: Floats  # (N,) see `deviations_of`; NaN where they are not known
+    values: Floats  # (N,)
+    usual: Floats  # (N,)
+
+    def reason(self, i: int, notes: Sequence[str]) -> str:
+        """Return in words why a body is unusual by this measure; `notes` are its rare repairs."""
+        value = float(self.values[i])
+        usual = float(self.usual[i])
+        return _REASONS[self.name].format(
+            value=value,
+            usual=usual,
+            square=value**2,
+            common=usual**2,
+            ratio=np.exp(min(value - usual, 50)),
+            notes="; ".join(notes),
+        )
 
 
 def measure_bodies(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Floats]:

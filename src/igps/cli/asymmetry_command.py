@@ -34,7 +34,7 @@ def asymmetry(
     import numpy as np
 
     from igps.analysis.asymmetry import MIN_SUBJECTS, asymmetries, find_pairs
-    from igps.cli.reading import Folder, described, print_failures
+    from igps.cli.reading import Folder, described
     from igps.fields.volumes.border import border_of
     from igps.report.figures import write_analysis
     from igps.report.tables import text_table
@@ -91,7 +91,6 @@ def asymmetry(
     print(text_table(titles, cells, left=("pair", "")))
     if all(one.score is None for one in found):
         print(f"no scores: fewer than {MIN_SUBJECTS} subjects have the same whole pair")
-    print_failures(result.failures, len(dataset))
     if out is not None:
         write_analysis(out, "asymmetry", rows)
         print(f"written to {out}")

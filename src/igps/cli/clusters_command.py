@@ -51,7 +51,7 @@ def clusters(
     from igps.analysis.clusters import STABLE, clusters_of
     from igps.analysis.comparison import pair_distances
     from igps.analysis.map import body_map, import_umap
-    from igps.cli.reading import Folder, described, print_failures
+    from igps.cli.reading import Folder, described
     from igps.data.sources import LABELS_FILE
     from igps.report.figures import clusters_figure, map_figure, save_both, write_analysis
     from igps.report.tables import text_table
@@ -75,7 +75,6 @@ def clusters(
 
     described_bodies = described(Folder(root, check=check), descriptor, **describing)
     dataset = described_bodies.dataset
-    print_failures(described_bodies.failures, len(dataset))
     module = described_bodies.descriptor
     tensor = pair_distances(module, described_bodies.descriptions, progress=True)
     distances = tensor.double().numpy()

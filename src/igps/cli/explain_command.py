@@ -52,6 +52,7 @@ def explain(
             of two molecules of one sequence also explain_residues.csv, and both superposed as explain_1.cif and
             explain_2.cif with the shares of residues in percent in place of B-factors.
     """
+    from igps.analysis.dissimilarity import REQUIREMENTS
     from igps.analysis.explanation import without_head
     from igps.cli.reading import Folder, described, files_or_folder
     from igps.descriptors import descriptor as descriptor_of
@@ -66,10 +67,11 @@ def explain(
     # Raises for other descriptors before anything is computed
     without_head(split_attributes(descriptor_of(descriptor))[0])
     if not isinstance(source, Folder):
-        result = described(source, descriptor, **{**describing, "strict": True})
+        result = described(source, descriptor, **{**describing, "strict": True}, also=REQUIREMENTS)
         found = _explain_pair(result, _only_pair(result.dataset), descriptor)
     elif axis is not None:
-        result = described(Folder(source.root, body=body), descriptor, **describing)
+        folder = Folder(source.root, body=body)
+        result = described(folder, descriptor, **describing, also=REQUIREMENTS)
         _print_kinds(result.dataset, body)
         found = _explain_pair(result, _ends_of_axis(result, axis), descriptor)
     else:
@@ -208,6 +210,7 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
     """Return the medoids of two groups, and their mean difference, painted on the body nearest to the mean."""
     import numpy as np
 
+    from igps.analysis.dissimilarity import REQUIREMENTS
     from igps.analysis.explanation import explain as explain_pair
     from igps.analysis.explanation import explain_groups, without_head
     from igps.analysis.groups import squared_distances
@@ -219,7 +222,7 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
     from igps.descriptors.with_attributes import split_attributes
     from igps.nn.description import describe
 
-    result = described(folder, descriptor, **describing)
+    result = described(folder, descriptor, **describing, also=REQUIREMENTS)
     dataset = result.dataset
     assert folder.check is not None
     labels: Any = folder.check(dataset.bodies)  # without the bodies that could not be used

@@ -115,7 +115,7 @@ def wide_table(metadata: Table, measured: Table) -> Table:
     after their files, or if the same names occur in several folders. Files that are only numbered stay one row each.
     """
     metadata = _with_rows(metadata)
-    row_names = next(iter(metadata.values()))
+    row_names = metadata["folder" if "folder" in metadata else "file"]
     rows: dict[str, dict[str | None, int]] = {}
     for i, (row, part) in enumerate(zip(row_names, metadata["part"], strict=True)):
         rows.setdefault(row, {})[part] = i
@@ -137,7 +137,7 @@ def wide_table(metadata: Table, measured: Table) -> Table:
 
 
 def _with_rows(metadata: Table) -> Table:
-    """Return metadata whose first column names the row of each body: its file, or its folder."""
+    """Return metadata with the column that names the row of each body: its file, or its folder."""
     folders = [PurePath(file).parent.as_posix() for file in metadata["file"]]
     parts = metadata["part"]
     n = len(parts)

@@ -58,7 +58,8 @@ def fit(
     from igps.nn.description import check_centres
     from igps.nn.specification import IN_FOLDER, specification
 
-    if out.is_dir() and not (out / IN_FOLDER).is_file() and (file := next(out.iterdir(), None)):
+    file = next(out.iterdir(), None) if out.is_dir() else None
+    if file is not None and not (out / IN_FOLDER).is_file():
         raise ValueError(
             f"out: expected a new or empty folder, or a model's, {out} holds {file.name}. Choose another."
         )

@@ -54,7 +54,7 @@ def groups(
     from igps._progress import Progress
     from igps.analysis.groups import group_test, with_q_values
     from igps.cli.inside_command import check_has_attribute, inside_vectors
-    from igps.cli.reading import Folder, described, print_failures
+    from igps.cli.reading import Folder, described
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import keeps_size
     from igps.mesh.mesh import millimetres
@@ -121,7 +121,6 @@ def groups(
         numbers.sort(key=lambda test: 1 if test.permanova_p is None else test.permanova_p)
         print(f"\nthe first of {len(numbers)} numbers, q over all of them")
         print(groups_table(numbers[:_N_NUMBERS]))
-    print_failures(result.failures, len(bodies))
     if out is not None:
         rows = [asdict(test) for test in [*tests, *numbers]]
         for row in rows:

@@ -32,7 +32,7 @@ def outliers(
     from igps.analysis.groups import squared_distances
     from igps.analysis.outliers import LIMIT, measure_bodies
     from igps.analysis.outliers import outliers as find_outliers
-    from igps.cli.reading import Folder, described, print_failures
+    from igps.cli.reading import Folder, described
     from igps.fields.volumes.border import border_of
     from igps.report.figures import outliers_figure, write_analysis
     from igps.report.tables import text_table
@@ -71,7 +71,6 @@ def outliers(
     print(
         f"{sum(o.is_outlier for o in ranked)} of {len(rows)} bodies are outliers, with a score above {LIMIT}"
     )
-    print_failures(result.failures, len(dataset))
     if out is not None:
         pictured = [
             (o, dataset.bodies.names[o.body], dataset.mesh(o.body)) for o in ranked[: min(top, 12)]

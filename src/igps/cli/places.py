@@ -9,7 +9,6 @@ import numpy as np
 from igps._arrays import Floats
 from igps.analysis.groups import squared_distances
 from igps.analysis.local_difference import (
-    LocalDifference,
     local_difference,
     misfit,
     offsets_of_bodies,
@@ -26,8 +25,6 @@ class Places:
     """Where two groups differ, on the body nearest to their mean."""
 
     painted: Painted
-    index: int  # of the painted body in the dataset
-    difference: LocalDifference
     legend: str
     words: str
 
@@ -81,4 +78,4 @@ def places_of_groups(
     if lies > _MAX_MISFIT:
         words += f"\nthe bodies lie {lies:.1%} of √area apart: if their poses differ, do not trust the picture"
     legend = f"{second} outside {first} ({unit}{size}); pale: not significant"
-    return Places(painted, index, found, legend, words)
+    return Places(painted, legend, words)

@@ -81,6 +81,7 @@ def signatures(
     time_limit: float | None = None,
     memory_limit: float | None = None,
     complete: bool = False,
+    also: Requirements | None = None,
     **collection: Any,
 ) -> tuple[SignatureDataset, list[Failure]]:
     """Compute the signatures that are missing in the cache.
@@ -88,6 +89,7 @@ def signatures(
     Args:
         source: bodies.
         descriptors: descriptors whose requirements the signatures must meet.
+        also: further requirements.
         strict, n_workers, time_limit, memory_limit, complete, collection: options of every command that reads bodies,
             see `igps.cli.shared_options.GROUPS`.
 
@@ -97,7 +99,10 @@ def signatures(
     Raises:
         ValueError: no body could be used.
     """
-    requirements = reduce(or_, (d.requirements for d in descriptors)) if descriptors else None
+    all_requirements = [d.requirements for d in descriptors]
+    if also is not None:
+        all_requirements.append(also)
+    requirements = reduce(or_, all_requirements) if all_requirements else None
     dataset = dataset_from_options(source, requirements, **collection)
     for descriptor in descriptors:
         check_attributes(descriptor, {*dataset.config.attributes, *dataset.pipeline.attributes})
@@ -131,7 +136,8 @@ def described(
 ) -> Described:
     """Describe bodies, after computing the signatures that are missing in the cache; see `signatures`.
 
-    The options `size` and `mirror` extend the name of a descriptor; they do not change a `Descriptor`.
+    Prints how many bodies could not be used. The options `size` and `mirror` extend the name of a descriptor; they do
+    not change a `Descriptor`.
     """
     if isinstance(descriptor, str):
         descriptor = with_side(descriptor, mirror, size)
@@ -151,13 +157,10 @@ def described(
         n_workers=n_workers,
         progress=True,
     )
-    return Described(
-        dataset.usable(undescribed or ()),
-        descriptions,
-        [*failures, *(undescribed or ())],
-        module,
-        name,
-    )
+    usable = dataset.usable(undescribed or ())
+    all_failures = [*failures, *(undescribed or ())]
+    print_failures(all_failures, len(usable))
+    return Described(usable, descriptions, all_failures, module, name)
 
 
 def _complete(dataset: SignatureDataset) -> SignatureDataset:
@@ -211,11 +214,12 @@ def print_failures(failures: Sequence[Failure], n_used: int) -> None:
 
 def with_side(descriptor: str, mirror: Mirror, size: Size) -> str:
     """Return the name, with +side if `mirror` is "distinct"; raise a ValueError if an option contradicts the name."""
+    name = descriptor_of(descriptor).name
     for option, value, excluded, suffix in (
         ("size", size, "ignore", SIZE),
         ("mirror", mirror, "same", SIDE),
     ):
-        if value == excluded and suffix in (name := descriptor_of(descriptor).name):
+        if value == excluded and suffix in name:
             raise ValueError(
                 f"{option}: expected no {value!r} with {name}, which has {suffix}. Leave one of them out."
             )

@@ -46,7 +46,7 @@ def retrieve(
             scores in a second table; distances.npz holds them as "reranked".
     """
     from igps.analysis.comparison import pair_distances
-    from igps.cli.reading import Folder, described, print_failures
+    from igps.cli.reading import Folder, described
     from igps.cli.report_command import check_report_folder
     from igps.cli.report_command import report as write_report
     from igps.retrieval import rerank as reranked_distances
@@ -68,7 +68,6 @@ def retrieve(
     if out is not None:  # before printing, because a closed pipe, as of `head`, ends the command
         _write_retrieval(out, result, summary, distances, is_query)
     print(tables)
-    print_failures(result.failures, len(result.dataset))
     if out is not None:
         print(f"written to {out}")
         if report:
@@ -129,7 +128,7 @@ def extract(
             for each of its bodies.
     """
     from igps.cli.feature_table import SUFFIXES
-    from igps.cli.reading import described, files_or_folder, print_failures, write_mending_notes
+    from igps.cli.reading import described, files_or_folder, write_mending_notes
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.size_and_side import SizeAndSide
     from igps.nn.descriptor import EmbeddedDescriptor
@@ -152,7 +151,6 @@ def extract(
     else:
         _write_features(out, result, short, wide)
     write_mending_notes(out.with_suffix(".notes.csv"), result.dataset)
-    print_failures(result.failures, len(result.dataset))
 
 
 def _write_archive(out: Path, result: Described, short: bool) -> None:
@@ -249,14 +247,14 @@ def query(
         description = _describe_body(mesh, known.descriptor, **{**describing, **options})
         bodies = known.dataset.bodies
         distance = known.descriptor.distances
-        n_listed = min(top, len(bodies))
-        n_candidates = min(max(top, N_RERANKED), len(bodies)) if rerank else n_listed
+        n_candidates = min(max(top, N_RERANKED) if rerank else top, len(bodies))
         ranking = search(description, known.descriptions, top=n_candidates, distance=distance)
+        indices = ranking.indices[0]
+        distances = ranking.distances[0]
         if rerank:
-            ranking = rerank_candidates(
-                description, ranking, lambda i: known.descriptions[i], distance, top=n_listed
-            )
-        pairs = zip(ranking.indices[0].tolist(), ranking.distances[0].tolist(), strict=True)
+            distances = rerank_candidates(description, known.descriptions[indices], distance)
+        nearest_first = distances.argsort(stable=True)[:top]
+        pairs = zip(indices[nearest_first].tolist(), distances[nearest_first].tolist(), strict=True)
         labels = bodies.labels or [None] * len(bodies)
         nearest = [(bodies.names[i], labels[i], value) for i, value in pairs]
     rows: list[dict[str, Any]] = [

@@ -38,7 +38,7 @@ def trajectory(
 
     from igps.analysis.comparison import pair_distances
     from igps.analysis.map import body_map
-    from igps.cli.reading import check_files, described, print_failures
+    from igps.cli.reading import check_files, described
     from igps.fields.molecules.trajectories import write_frames
     from igps.report.figures import map_figure, write_analysis
 
@@ -67,7 +67,6 @@ def trajectory(
         f"{n_frames} frames; farthest from the first: frame {farthest['frame']}, "
         f"{farthest['distance_to_first']:.3g} by {result.descriptor.name}; stress {layout.stress:.2f}"
     )
-    print_failures(result.failures, n_frames)
     figure = map_figure(layout, [float(row["frame"]) for row in rows], "frame")
     write_analysis(out, "trajectory", rows, figure)
     print(f"written to {out}")

@@ -6,12 +6,14 @@ to the mean of its neighbours. The factor is calibrated on generated bodies, see
 numbers of handles are not the same.
 """
 
+from __future__ import annotations
+
 import contextlib
 import filecmp
 import math
 from collections.abc import Iterator
-from dataclasses import replace
-from functools import lru_cache, partial
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
 from typing import Literal
 
 import numpy as np
@@ -82,6 +84,19 @@ def _is_changed(one: SurfaceSamples, other: SurfaceSamples, distance: float) -> 
     return distance > _SAME_SURFACE and changed_share(one, other, _ROUNDING) >= _MIN_CHANGED
 
 
+@dataclass(frozen=True, eq=False)
+class _PlacedMesh:
+    """A mesh and its vertices (V, 3) in the coordinates of its `SurfaceSamples`."""
+
+    mesh: Mesh
+    vertices: Floats
+
+    @cached_property
+    def triangles(self) -> TriangleSurface:
+        """The surface, for searches of nearest points."""
+        return TriangleSurface(self.vertices, self.mesh.faces)
+
+
 class Surfaces:
     """Comparison of the surfaces of a dataset. The most recently used samples and meshes stay in memory.
 
@@ -96,9 +111,7 @@ class Surfaces:
         self.failures: dict[int, Failure] = {}
         self._dataset = dataset
         self._cached_samples = lru_cache(_N_CACHED_SAMPLES)(self.samples)
-        self._cached_mesh = lru_cache(_N_CACHED_MESHES)(self._mesh)
-        self._cached_triangles = lru_cache(_N_CACHED_MESHES)(self._triangles)
-        self._cached_vertices = lru_cache(_N_CACHED_MESHES)(self._vertices_and_faces)
+        self._cached_mesh = lru_cache(_N_CACHED_MESHES)(self._placed_mesh)
         self._cached_coarseness = lru_cache(None)(self._coarseness_and_handles)
 
     def samples(self, i: int) -> SurfaceSamples:
@@ -107,7 +120,7 @@ class Surfaces:
         samples = SurfaceSamples.of(
             signature.surface.points, signature.surface.attributes[_NORMALS], signature.area
         )
-        return replace(samples, surface=partial(self._cached_triangles, i))
+        return replace(samples, surface=lambda: self._cached_mesh(i).triangles)
 
     def coarseness(self, i: int) -> float:
         """Return the distance, over √area, between a mesh and the mesh with vertices at the means of their neighbours.
@@ -145,7 +158,8 @@ class Surfaces:
         with contextlib.suppress(OSError):
             if one.part == other.part and filecmp.cmp(one.path, other.path, shallow=False):
                 return "same file", 0.0
-        if (deviation := self._vertex_deviation(i, j)) <= _SAME_SURFACE:
+        deviation = self._vertex_deviation(i, j)
+        if deviation <= _SAME_SURFACE:
             return "same mesh", deviation
         samples = map(self._cached_samples, (i, j))
         deviation = surface_distance(
@@ -173,10 +187,8 @@ class Surfaces:
         The limit is 0 if the bodies have different numbers of handles, or if their meshes have the same faces, but
         vertices at other places. Raises a MeshError if a body cannot be used.
         """
-        (coarseness_i, handles_i), (coarseness_j, handles_j) = (
-            self._cached_coarseness(i),
-            self._cached_coarseness(j),
-        )
+        coarseness_i, handles_i = self._cached_coarseness(i)
+        coarseness_j, handles_j = self._cached_coarseness(j)
         differ = None not in (handles_i, handles_j) and handles_i != handles_j
         if differ or _ROUNDING < self._vertex_deviation(i, j) < math.inf:
             return 0.0
@@ -192,8 +204,8 @@ class Surfaces:
 
         def moments_of(i: int) -> Floats | None:
             with contextlib.suppress(MeshError):  # recorded in `failures`
-                mesh = self._mesh(i)
-                return moments(self._placed(i, mesh), mesh.faces, max_move)
+                body = self._placed_mesh(i)
+                return moments(body.vertices, body.mesh.faces, max_move)
             return None
 
         results = on_threads(moments_of, range(len(self._dataset)), n_workers)
@@ -205,10 +217,9 @@ class Surfaces:
 
     def _coarseness_and_handles(self, i: int) -> tuple[float, int | None]:
         """Return coarseness and number of handles: None for an open mesh, or if mending may have changed it."""
-        mesh = self._cached_mesh(i)
-        smoothed = TriangleSurface(
-            mean_of_neighbours(self._placed(i, mesh), mesh.faces), mesh.faces
-        )
+        body = self._cached_mesh(i)
+        mesh = body.mesh
+        smoothed = TriangleSurface(mean_of_neighbours(body.vertices, mesh.faces), mesh.faces)
         handles = None
         if not set(repair_steps(mesh.notes)) - _HANDLE_PRESERVING:
             with contextlib.suppress(MeshError):
@@ -220,7 +231,8 @@ class Surfaces:
 
         Meshes with the same faces have the same level of detail, which therefore cannot explain a moved vertex.
         """
-        (one, faces_i), (other, faces_j) = self._cached_vertices(i), self._cached_vertices(j)
+        one, faces_i = self._vertices_and_faces(i)
+        other, faces_j = self._vertices_and_faces(j)
         if not np.array_equal(faces_i, faces_j):
             return math.inf
         rotation, _ = orthogonal_procrustes(one, other)
@@ -228,28 +240,19 @@ class Surfaces:
 
     def _vertices_and_faces(self, i: int) -> tuple[Floats, Integers]:
         """Return the vertices of the file, centred and over √area, and the faces with sorted corners."""
-        mesh = self._cached_mesh(i)
-        if "subdivided" in repair_steps(
-            mesh.notes
-        ):  # how finely depends on the number of eigenpairs
+        mesh = self._cached_mesh(i).mesh
+        if "subdivided" in repair_steps(mesh.notes):  # how finely depends on the eigenpairs
             body = self._dataset.bodies[i]
             mesh = load_mesh(body.path, self._dataset.pipeline.reading, part=body.part)
-        return (mesh.vertices - mesh.vertices.mean(axis=0)) / math.sqrt(mesh.area), np.sort(
-            mesh.faces, axis=1
-        )
+        centred = mesh.vertices - mesh.vertices.mean(axis=0)
+        return centred / math.sqrt(mesh.area), np.sort(mesh.faces, axis=1)
 
-    def _triangles(self, i: int) -> TriangleSurface:
-        mesh = self._cached_mesh(i)
-        return TriangleSurface(self._placed(i, mesh), mesh.faces)
-
-    def _placed(self, i: int, mesh: Mesh) -> Floats:
-        """Return the vertices of a mesh in the coordinates of its `SurfaceSamples`."""
-        signature = self._signature(i)
-        return (mesh.vertices - signature.surface.points.mean(axis=0)) / math.sqrt(signature.area)
-
-    def _mesh(self, i: int) -> Mesh:
+    def _placed_mesh(self, i: int) -> _PlacedMesh:
         with self._record_failure(i):
-            return self._dataset.mesh(i)
+            mesh = self._dataset.mesh(i)
+        signature = self._signature(i)
+        centred = mesh.vertices - signature.surface.points.mean(axis=0)
+        return _PlacedMesh(mesh, centred / math.sqrt(signature.area))
 
     def _signature(self, i: int) -> Signature:
         with self._record_failure(i):

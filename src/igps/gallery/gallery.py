@@ -15,13 +15,11 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.descriptors.registry import is_file
 from igps.gallery.about import about_of, check_alike
-from igps.gallery.columns import Found
 from igps.gallery.opening import tables
 from igps.gallery.rows import described_rows, further_columns
 from igps.mesh.options import LoadOptions
 from igps.nn.description import check_centres, describe
 from igps.nn.descriptor import Descriptor
-from igps.retrieval.ranking import SearchResult
 from igps.retrieval.reranking import N_RERANKED, rerank_candidates
 from igps.signature.signature import SignatureConfig
 
@@ -137,46 +135,20 @@ class Gallery:
         check_at_least(1, top=top)
         matches = []
         for query in descriptions:
-            n_near = max(top, N_RERANKED) if rerank else top
-            found = self.search(query[None], top=n_near, exact=exact, where=where)
-            if rerank:
-                found = self._reranked(query[None], found, top)
-            rows, distances, _ = found
-            pairs = zip(rows, distances.tolist(), strict=True)
-            matches.append([_match(row, distance) for row, distance in pairs])
+            with torch.inference_mode():
+                rows, distances, near = self.table.nearest(
+                    query[None],
+                    self.descriptor.distances,
+                    top=max(top, N_RERANKED) if rerank else top,
+                    candidates=CANDIDATES,
+                    exact=exact,
+                    where=where,
+                )
+                if rerank and rows:
+                    distances = rerank_candidates(query[None], near, self.descriptor.distances)
+            nearest_first = distances.argsort(stable=True)[:top].tolist()
+            matches.append([_match(rows[i], float(distances[i])) for i in nearest_first])
         return matches
-
-    def search(
-        self, query: Tensor, *, top: int, exact: bool = False, where: str | None = None
-    ) -> Found:
-        """Return the rows, distances and descriptions of the bodies closest to a description (1, ...)."""
-        with torch.inference_mode():
-            found: Found = self.table.nearest(
-                query,
-                self.descriptor.distances,
-                top=top,
-                candidates=CANDIDATES,
-                exact=exact,
-                where=where,
-            )
-        return found
-
-    def _reranked(self, query: Tensor, found: Found, top: int) -> Found:
-        """Order what `search` found by the neighbours that the bodies share."""
-        rows, distances, near = found
-        if not rows:
-            return found
-        ranking = SearchResult(torch.arange(len(rows))[None], distances[None])
-        with torch.inference_mode():
-            reranked = rerank_candidates(
-                query,
-                ranking,
-                near.__getitem__,
-                self.descriptor.distances,
-                top=min(top, len(rows)),
-            )
-        order = reranked.indices[0]
-        return [rows[i] for i in order.tolist()], reranked.distances[0], near[order]
 
     @classmethod
     def build(

@@ -1,6 +1,5 @@
 """Re-ranking: new distances of a collection from the neighbours that shapes have in common, without labels."""
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +9,6 @@ from torch import Tensor
 
 from igps._arrays import Floats, Integers
 from igps.retrieval.distances import Distance, check_tensor
-from igps.retrieval.ranking import SearchResult, rank
 
 N_RERANKED = 200
 """Number of nearest entries of a single query that are re-ranked, by their neighbourhoods among each other."""
@@ -87,34 +85,16 @@ def jaccard_distances(
     return np.maximum(1 - common / (2 - common), 0)
 
 
-def rerank_candidates(
-    queries: Tensor,
-    found: SearchResult,
-    descriptions: Callable[[Tensor], Tensor],
-    distance: Distance,
-    *,
-    top: int,
-) -> SearchResult:
-    """Re-rank the search results of each query by `rerank` of the query and these results alone.
-
-    The new distances have no unit.
+def rerank_candidates(query: Tensor, candidates: Tensor, distance: Distance) -> Tensor:
+    """Return new distances (M,) of candidates from a query, by `rerank` of both alone; they have no unit.
 
     Args:
-        queries: (Q, ...) descriptions.
-        found: (Q, M) the nearest entries of each query. M should be larger than `top`, such as `N_RERANKED`.
-        descriptions: a function from entries (M,) to their descriptions (M, ...).
+        query: (1, ...) description.
+        candidates: (M, ...) descriptions of its nearest neighbours, such as `N_RERANKED`.
         distance: of descriptions.
-        top: number of entries to return for each query.
     """
-    indices = []
-    distances = []
-    for query, entries in zip(queries, found.indices, strict=True):
-        members = torch.cat([query[None], descriptions(entries).to(query)])
-        reranked = rerank(distance(members, members))[:1, 1:]
-        best = rank(reranked)[:, :top]
-        indices.append(entries[best[0].to(entries.device)])
-        distances.append(reranked.gather(1, best)[0])
-    return SearchResult(torch.stack(indices), torch.stack(distances))
+    members = torch.cat([query, candidates.to(query)])
+    return rerank(distance(members, members))[0, 1:]
 
 
 def _nearest_first(distances: Floats, n_listed: int) -> Integers:

@@ -103,7 +103,7 @@ def test_short_chains_have_no_far_pairs_and_padding_changes_nothing() -> None:
 def test_shares_of_samples_add_up_to_the_distance() -> None:
     pair = [signature(walk(seed), np.arange(150.0), np.arange(N) % 150) for seed in (4, 5)]
     one, other = (collate([item]) for item in pair)
-    told = explain(fold(), one, other)
+    told = explain(fold(), one, other, weights=[np.ones(len(x.surface)) for x in pair])
     wanted = float(fold().distances(fold()(one), fold()(other)))
     assert told.distance == pytest.approx(wanted, rel=1e-4)
     assert told.parts == {"fold": pytest.approx(told.distance)}

@@ -119,7 +119,9 @@ def test_shares_of_another_kind_are_named():
 
 def test_an_explanation_names_four_parts_and_their_samples():
     found = described(signature(0, 0), signature(1, 0))
-    told = explain(molecular(), collate([signature(0, 0)]), collate([signature(1, 0)]))
+    pair = [signature(0, 0), signature(1, 0)]
+    one, other = (collate([each]) for each in pair)
+    told = explain(molecular(), one, other, weights=[np.ones(len(x.surface)) for x in pair])
     distance = float(molecular().distances(found[:1], found[1:]))
     assert told.distance == pytest.approx(distance, rel=1e-3)
     expected = pytest.approx(told.distance, rel=1e-6)

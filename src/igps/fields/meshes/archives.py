@@ -30,9 +30,10 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     with tempfile.TemporaryDirectory() as folder:
         for name, unpacked in _unpack(path, Path(folder), options):
             try:
-                if part in (None, name) and (
-                    inner := _read_unpacked(unpacked, path, options, None)
-                ):
+                inner = []
+                if part in (None, name):
+                    inner = _read_unpacked(unpacked, path, options, None)
+                if inner:
                     bodies.append(replace(joined(inner), part=name))
             except MeshError as fault:
                 if options.bodies != "objects":  # otherwise the whole would be incomplete

@@ -37,10 +37,8 @@ class VertexAttribute(FileAttribute):
             return source.values(body, file, name, points)
         raw = read_surface(body.path, self.reading, part=body.part)
         values = vertex_values.chosen(vertex_values.read(file), name, file)
-        if len(values) != (n_own := len(raw.vertices)) and self.reading.bodies in (
-            "pieces",
-            "objects",
-        ):
+        n_own = len(raw.vertices)
+        if len(values) != n_own and self.reading.bodies in ("pieces", "objects"):
             raw = read_surface(body.path, replace(self.reading, bodies="whole"))
         if len(values) != len(raw.vertices):
             whole = f" ({len(raw.vertices)} in the whole file)" * (len(raw.vertices) != n_own)

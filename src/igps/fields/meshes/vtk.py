@@ -34,6 +34,18 @@ _LEGACY_TYPES = {  # VTK writes vtkIdType as int
     "unsigned_char": "u1",
     "vtkidtype": "i4",
 }
+_XML_TYPES = {
+    "Float32": "f4",
+    "Float64": "f8",
+    "Int8": "i1",
+    "Int16": "i2",
+    "Int32": "i4",
+    "Int64": "i8",
+    "UInt8": "u1",
+    "UInt16": "u2",
+    "UInt32": "u4",
+    "UInt64": "u8",
+}
 _BLANK_LINE = re.compile(rb"\n\r?\n")
 # Types of cells by the sections of legacy and of XML files.
 _LEGACY_CELLS = {
@@ -268,11 +280,7 @@ class _Xml:
         return vertices, cells
 
     def array(self, element: Element) -> NDArray[np.generic]:
-        name = element.get("type", "")
-        kind = np.dtype(
-            f"{'f' if name.startswith('F') else name[0].lower()}{int(name.lstrip('UIntFloa')) // 8}"
-        )
-        kind = kind.newbyteorder(self._order)
+        kind = np.dtype(_XML_TYPES[element.get("type", "")]).newbyteorder(self._order)
         encoding = element.get("format")
         text = element.text or ""
         if encoding == "ascii":

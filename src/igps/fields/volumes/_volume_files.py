@@ -69,7 +69,8 @@ class RawVolume:
 
 def read_raw(path: Path) -> RawVolume:
     """Read a volume with the reader for its suffix."""
-    if (reader := READERS.get(suffix_of(path))) is None:
+    reader = READERS.get(suffix_of(path))
+    if reader is None:
         raise MeshError(
             f"{path}: not a format of volumes. Convert it to one of {', '.join(READERS)}."
         )
@@ -355,15 +356,17 @@ def _header(path: Path) -> bytes:
         rb"\n\r?\n" if suffix_of(path) in _NRRD else rb"^\s*ElementDataFile\s*[=:].*\n",
         re.MULTILINE,
     )
+    header = b""
     with path.open("rb") as file:
-        header = b""
-        while (
-            (match := end.search(header)) is None
-            and len(header) < _MAX_HEADER
-            and (block := file.read(1 << 16))
-        ):
+        while len(header) < _MAX_HEADER:
+            block = file.read(1 << 16)
             header += block
-    return header if match is None else header[: match.end()]
+            match = end.search(header)
+            if match is not None:
+                return header[: match.end()]
+            if not block:
+                break
+    return header
 
 
 def _highdicom(path: Path) -> RawVolume:

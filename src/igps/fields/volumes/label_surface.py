@@ -104,9 +104,8 @@ def voxel_surface(
     mask = fill_missed_slices(mask[box], notes) if joins else mask[box]
     voxel = Voxel(abs(float(np.linalg.det(matrix[:3, :3]))), unit)
     mask, hollows = _clean(mask, notes, MIN_VOXELS if cavities else None, name, voxel)
-    if cavities and (n_open := _n_nearly_enclosed(mask)) > _MIN_OPEN_CAVITY * np.count_nonzero(
-        mask
-    ):
+    n_open = _n_nearly_enclosed(mask) if cavities else 0
+    if n_open > _MIN_OPEN_CAVITY * np.count_nonzero(mask):
         notes.append(
             f"a cavity of about {counted(n_open, 'voxel')} is open through gaps of up to two voxels in its wall"
         )
