@@ -133,7 +133,7 @@ def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tm
         icosphere(subdivisions=2, radius=1 + i).export(tmp_path / f"{i}.off")
     text = "parts: [{eigenpairs: 20, axes: [height: {quantiles: 4, soft: true}, interior_distance: {n_bins: 8}]}]"
     own = igps.descriptor(write(tmp_path, text))
-    heights = {"height": lambda points: points[:, 2]}
+    heights = {"height": lambda body, points: points[:, 2]}
     files = [tmp_path / f"{i}.off" for i in range(2)]
     dataset = SignatureDataset(
         files, cache_dir=tmp_path / "cache", descriptor=own, attributes=heights
@@ -210,7 +210,7 @@ def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp
 
 def test_an_attribute_adds_its_histograms_with_its_weight(bodies, tmp_path):
     files = [tmp_path / f"{i}.off" for i in range(3)]
-    heights = {"height": lambda points: points[:, 2]}
+    heights = {"height": lambda body, points: points[:, 2]}
     whole = igps.descriptor("pretrained+height=0.5")
     assert isinstance(whole, WithAttributes)
     dataset = SignatureDataset(
