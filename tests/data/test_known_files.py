@@ -1,13 +1,14 @@
+import hashlib
 import logging
 import os
 import sqlite3
 import time
+from pathlib import Path
 
 import pytest
 from bodies_on_disk import write_body
 
 from igps.data.dataset import SignatureDataset
-from igps.data.keys import FileDigest
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
@@ -29,13 +30,13 @@ pytestmark = pytest.mark.usefixtures("trust_recent_files")
 def read(monkeypatch):
     """Names of the mesh files that are read for their key."""
     names = []
-    read_file = FileDigest.of
+    read_file = hashlib.file_digest
 
-    def reading(path):
-        names.append(path.name)
-        return read_file(path)
+    def reading(file, algorithm):
+        names.append(Path(file.name).name)
+        return read_file(file, algorithm)
 
-    monkeypatch.setattr("igps.data.keys.FileDigest.of", reading)
+    monkeypatch.setattr("igps.data.keys.hashlib.file_digest", reading)
     return names
 
 

@@ -8,12 +8,11 @@ key and of its own parameters as key, see `derived_key`.
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from igps.mesh.formats import stat_key
 from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION
 from igps.mesh.mesh import Mesh
@@ -21,41 +20,20 @@ from igps.mesh.options import LoadOptions
 from igps.signature.config import SignatureConfig
 from igps.signature.measures import MEASURES_VERSION
 
-Stamp = tuple[int, int, int]
-"""Size in bytes, and times of the last change of the content and of the metadata in nanoseconds, see `stat_key`."""
-
-
-@dataclass(frozen=True)
-class FileDigest:
-    """The content of a file at one time."""
-
-    path: Path
-    stamp: Stamp
-    digest: bytes  # SHA-256
-
-    @staticmethod
-    def of(path: Path) -> "FileDigest":
-        """Read a file; raise an OSError if that fails."""
-        stamp = stat_key(path)  # before the content: a later change gives the file another stamp
-        with open(path, "rb") as file:
-            digest = hashlib.file_digest(file, "sha256").digest()
-        return FileDigest(path, stamp, digest)
-
 
 @dataclass(frozen=True)
 class Content:
     """The content of a body: of its file and of the files that are read with it, or of its mesh in memory."""
 
     digest: bytes
-    files: tuple[FileDigest, ...] = ()  # none if the body is in memory
     nameless: bytes | None = None  # the digest without a table of names; None if there is no table
 
     @staticmethod
-    def of_files(files: Sequence[FileDigest], names: Sequence[Path] = ()) -> "Content":
-        """Return the content of a file and its companions, of which `names` only name the bodies."""
-        own = [file.digest for file in files if file.path not in names]
-        nameless = _joint(own) if len(own) < len(files) else None
-        return Content(_joint([file.digest for file in files]), tuple(files), nameless)
+    def of_files(digests: Mapping[Path, bytes], names: Sequence[Path] = ()) -> "Content":
+        """Return the content of a file and its companions, by their digests; `names` only name the bodies."""
+        own = [digest for path, digest in digests.items() if path not in names]
+        nameless = _joint(own) if len(own) < len(digests) else None
+        return Content(_joint([*digests.values()]), nameless)
 
     @staticmethod
     def of_mesh(mesh: Mesh) -> "Content":
@@ -67,7 +45,13 @@ class Content:
 
 def content_digest(*files: Path) -> bytes:
     """Return a digest of the content of a file and of the companion files that are read with it."""
-    return Content.of_files([FileDigest.of(file) for file in files]).digest
+    return Content.of_files({file: file_digest(file) for file in files}).digest
+
+
+def file_digest(path: Path) -> bytes:
+    """Return the SHA-256 of a file; raise an OSError if it cannot be read."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
 
 
 def signature_key(

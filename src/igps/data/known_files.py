@@ -8,7 +8,7 @@ import time
 from collections.abc import Generator, Iterable
 from pathlib import Path
 
-from igps.data.keys import FileDigest
+from igps.data.keys import file_digest
 from igps.mesh.formats import stat_key
 
 logger = logging.getLogger(__name__)
@@ -33,23 +33,26 @@ class KnownFiles:
     def __init__(self, cache_dir: Path) -> None:
         self._path = cache_dir / _FILE
 
-    def digests(self, paths: Iterable[Path]) -> dict[Path, FileDigest]:
+    def digests(self, paths: Iterable[Path]) -> dict[Path, bytes]:
         """Return the digests of files, which are read only if they are new or have changed.
 
         Files that cannot be read are left out.
         """
         unique = dict.fromkeys(paths)
         found = self._unchanged(unique)
-        new = {}
+        rows = []
         for path in unique:
-            if path not in found:
-                with contextlib.suppress(OSError):
-                    new[path] = FileDigest.of(path)
-        self._remember(new.values())
-        return found | new
+            if path in found:
+                continue
+            with contextlib.suppress(OSError):
+                stamp = stat_key(path)  # before the content: a later change gives another stamp
+                found[path] = file_digest(path)
+                rows.append((os.path.abspath(path), *stamp, found[path]))
+        self._remember(rows)
+        return found
 
-    def _unchanged(self, paths: Iterable[Path]) -> dict[Path, FileDigest]:
-        found: dict[Path, FileDigest] = {}
+    def _unchanged(self, paths: Iterable[Path]) -> dict[Path, bytes]:
+        found: dict[Path, bytes] = {}
         if not self._path.exists():
             return found
         with self._tolerate_errors(), contextlib.closing(self._database()) as database:
@@ -60,21 +63,17 @@ class KnownFiles:
                 *stamp, digest = row
                 with contextlib.suppress(OSError):
                     if stat_key(path) == tuple(stamp):
-                        found[path] = FileDigest(path, stat_key(path), digest)
+                        found[path] = digest
         return found
 
-    def _remember(self, files: Iterable[FileDigest]) -> None:
+    def _remember(self, rows: Iterable[tuple[str, int, int, int, bytes]]) -> None:
         """Record digests, except for files that were changed just now."""
         now = time.time_ns()
-        rows = [
-            (os.path.abspath(file.path), *file.stamp, file.digest)
-            for file in files
-            if now - max(file.stamp[1:]) > MIN_AGE
-        ]
-        if not rows:
+        old = [row for row in rows if now - max(row[2:4]) > MIN_AGE]
+        if not old:
             return
         with self._tolerate_errors(), contextlib.closing(self._database()) as database, database:
-            database.executemany("INSERT OR REPLACE INTO file VALUES (?, ?, ?, ?, ?)", rows)
+            database.executemany("INSERT OR REPLACE INTO file VALUES (?, ?, ?, ?, ?)", old)
 
     def _database(self) -> sqlite3.Connection:
         self._path.parent.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from igps.data.cache import Cache, Record
-from igps.data.keys import Content, FileDigest, derived_key
+from igps.data.keys import Content, derived_key
 from igps.data.known_files import KnownFiles
 from igps.data.pipeline import version
 from igps.mesh.errors import MeshError, NoBodyError
@@ -34,13 +34,13 @@ class Listing:
                     several[path] = dependencies_of(path, self.options)
             except MeshError:
                 continue
-        known: dict[Path, FileDigest] = {}
+        known: dict[Path, bytes] = {}
         if self.cache_dir is not None:
             files = (file for group in several.values() for file in group)
             known = KnownFiles(self.cache_dir).digests(files)
         for path, files in several.items():
             if all(file in known for file in files):
-                content = Content.of_files([known[file] for file in files])
+                content = Content.of_files({file: known[file] for file in files})
                 listed[path] = self._cached(path, content)
             else:
                 listed[path], _ = _read(path, self.options)

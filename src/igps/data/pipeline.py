@@ -17,7 +17,7 @@ from igps.data.added_attributes import AttributeSource, with_attribute
 from igps.data.attribute_sources import with_load_options
 from igps.data.cache import Cache, Kind, Record, decode, encode
 from igps.data.cache_hit import CacheHit
-from igps.data.keys import Content, FileDigest, derived_key, signature_key
+from igps.data.keys import Content, derived_key, file_digest, signature_key
 from igps.data.surfaces import known_surface, surface_record
 from igps.failures import Failed, MachineError, attempt
 from igps.mesh.errors import MeshError
@@ -121,15 +121,15 @@ class SignaturePipeline:
             key = signature_key(content, body, self.reading, None)
             self.put("surface", key, surface_record(raw))
 
-    def content(self, body: BodyRef, known: Mapping[Path, FileDigest] | None = None) -> Content:
+    def content(self, body: BodyRef, known: Mapping[Path, bytes] | None = None) -> Content:
         """Return the content of a body, with the digests of files that are known; raise a MeshError if unreadable."""
         if body in self.meshes:
             return Content.of_mesh(self.mesh(body))
         known = known or {}
         try:
             paths = dependencies_of(body.path, self.reading)
-            files = [known.get(path) or FileDigest.of(path) for path in paths]
-            return Content.of_files(files, names_of(body.path, self.reading))
+            digests = {path: known.get(path) or file_digest(path) for path in paths}
+            return Content.of_files(digests, names_of(body.path, self.reading))
         except OSError as error:
             cause = f"{body.path}: cannot be read ({error.strerror})"
             raise MeshError(f"{cause}. Check the path.") from error

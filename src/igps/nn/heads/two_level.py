@@ -53,7 +53,7 @@ class TwoLevelHead(Head):
         class_head: fitted to classes.
         body_heads: fitted to bodies, with lengths; if None, a single head for the whole description.
         scales: sₖ of the body heads, in units of their distances (with median 0.5).
-        exponents: pₖ of the body heads, positive, with sum 1; equal if None.
+        exponents: pₖ of the body heads, positive, with sum 1.
         share: share of the squared length of an embedding that belongs to the body heads.
 
     Raises:
@@ -72,7 +72,7 @@ class TwoLevelHead(Head):
         body_heads: Sequence[WCCNHead] | None = None,
         *,
         scales: Sequence[float] = (0.1,),
-        exponents: Sequence[float] | None = None,
+        exponents: Sequence[float] = (1.0,),
         share: float = 0.5,
     ) -> None:
         super().__init__()
@@ -81,7 +81,6 @@ class TwoLevelHead(Head):
             body_heads or [WCCNHead(n_directions=64, shrinkage=0.3, lengths=True)]
         )
         n_heads = len(self.body_heads)
-        exponents = [1 / n_heads] * n_heads if exponents is None else exponents
         check_fraction(share=share)
         if not all(bool(head.lengths) for head in self._body_heads()):
             raise ValueError("body_heads: expected heads with lengths. Use WCCNHead(lengths=True).")
