@@ -51,21 +51,12 @@ class Limits:
                 raise ValueError(f"{name}: expected None or a positive number, got {value}.")
 
 
-def is_machine_error(error: OSError) -> bool:
-    """Return whether the machine is at fault, not a single file: a full or broken disk, a missing permission."""
-    return _remedy(error) is not None
-
-
-def machine_error_text(error: OSError) -> str:
-    """Return the message of an error for which `is_machine_error` holds, with a remedy."""
-    return f"{error}. {_remedy(error)} and run again: finished results are kept."
-
-
-def _remedy(error: OSError) -> str | None:
-    name = errno.errorcode.get(error.errno or 0)
+def machine_error(error: BaseException) -> MachineError | None:
+    """Return an error, with a remedy, if the machine is at fault: a full or broken disk, a missing permission."""
+    name = errno.errorcode.get(getattr(error, "errno", None) or 0)
     for remedy, names in _REMEDIES.items():
         if name in names:
-            return remedy
+            return MachineError(f"{error}. {remedy} and run again: finished results are kept.")
     return None
 
 
@@ -88,8 +79,9 @@ def attempt(function: Callable[[], Result], limits: Limits = Limits()) -> Result
             f"{str(error).rstrip('.')}. Install it and run again: finished results are kept."
         ) from error
     except OSError as error:
-        if is_machine_error(error):
-            raise MachineError(machine_error_text(error)) from error
+        fault = machine_error(error)
+        if fault is not None:
+            raise fault from error
         return Failed.of(error)
     except Exception as error:
         # Dask raises KilledWorker after several workers died with the same job.

@@ -41,12 +41,11 @@ def errors_as_messages() -> Iterator[None]:
         )
         sys.exit(2)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
-        from igps.failures import MachineError, is_machine_error, machine_error_text
+        from igps.failures import MachineError, machine_error
 
-        is_system = isinstance(error, OSError) and is_machine_error(error)
-        text = machine_error_text(error) if isinstance(error, OSError) and is_system else error
-        print(f"igps: {text}", file=sys.stderr)
-        sys.exit(2 if is_system or isinstance(error, MachineError) else 1)
+        shown = machine_error(error) or error
+        print(f"igps: {shown}", file=sys.stderr)
+        sys.exit(2 if isinstance(shown, MachineError) else 1)
 
 
 def main() -> None:
