@@ -21,6 +21,7 @@ from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.signature.signature import SignatureConfig
 from igps.sklearn import VolumetricFeatures
+from label_files import write_nifti
 from own_descriptors import changed
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=12, min_samples=0, n_surface_samples=20)
@@ -107,11 +108,10 @@ def test_a_column_of_a_table_is_a_list(paths, features):
 
 
 def test_a_file_of_several_bodies_is_no_row(tmp_path):
-    nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((12, 12, 12), np.uint8)
     labels[1:6, 1:11, 1:11] = 1
     labels[7:11, 1:11, 1:11] = 2
-    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "a.nii.gz")
+    write_nifti(tmp_path / "a.nii.gz", labels)
     features = VolumetricFeatures("interior", cache_dir=tmp_path, n_workers=1)
     words = r"got several, such as .*a\.nii\.gz#1\. Name each as FILE#PART"
     with pytest.raises(ValueError, match=words):

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import nibabel
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,6 +11,7 @@ from commands import error_of, run
 from igps.analysis.asymmetry import asymmetries, find_pairs
 from igps.data.sources import Bodies
 from igps.mesh.loading import BodyRef
+from label_files import write_nifti
 
 
 def bodies_called(names):
@@ -112,7 +112,7 @@ def test_the_command_finds_the_subject_whose_kidney_is_flat(tmp_path, capsys):
         left = kidney(axes)
         right = kidney(axes * [1, 0.5 if subject == 4 else 1, 1])[::-1]
         labels = np.concatenate([right * 2, left * 3]).astype(np.uint8)
-        nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), folder / f"s{subject}.nii.gz")
+        write_nifti(folder / f"s{subject}.nii.gz", labels)
     words = ["--descriptor", "own_descriptors:small_interior", "--cache_dir", tmp_path / "cache"]
     words += ["--signature.n_eigenpairs", 20, "--n_workers", 1]
     named = ["--names", "totalsegmentator"]

@@ -29,6 +29,7 @@ from igps.mesh.loading import BodyRef, load_bodies
 from igps.mesh.options import LoadOptions
 from igps.report.tables import findings_table
 from igps.signature.signature import SignatureConfig, compute_signature
+from label_files import write_nifti
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 
@@ -145,18 +146,11 @@ def test_the_cost_is_that_of_the_mesh_that_is_simplified(tmp_path):
 
 
 def test_what_was_examined_is_not_read_again(tmp_path, monkeypatch):
-    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     labels = np.zeros((16, 14, 12), dtype=np.uint8)
-    nibabel.save(
-        nibabel.Nifti1Image(labels, np.eye(4)),
-        tmp_path / "empty.nii",
-    )
+    write_nifti(tmp_path / "empty.nii", labels)
     labels[2:12, 2:12, 2:7] = 1
     labels[3:13, 3:11, 7:11] = 2
-    nibabel.save(
-        nibabel.Nifti1Image(labels, np.eye(4)),
-        tmp_path / "two.nii",
-    )
+    write_nifti(tmp_path / "two.nii", labels)
     findings(tmp_path)
     other = replace(CONFIG, resolution=8)
     meshes = load_bodies(tmp_path / "two.nii")
@@ -176,15 +170,11 @@ def test_what_was_examined_is_not_read_again(tmp_path, monkeypatch):
 
 
 def test_labels_of_a_volume_are_told_one_by_one_by_their_voxels(tmp_path):
-    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     labels = np.zeros((30, 20, 20), dtype=np.uint8)
     labels[2:14, 4:16, 4:16] = labels[16:17, 2:3, 2:3] = 1  # a cube, and a voxel apart
     labels[17:29, 4:16, 4:6] = 2  # a plate of two voxels
     labels[17:24, 2, 18] = 3
-    nibabel.save(
-        nibabel.Nifti1Image(labels, np.eye(4)),
-        tmp_path / "x.nii.gz",
-    )
+    write_nifti(tmp_path / "x.nii.gz", labels)
     (tmp_path / "x.csv").write_text("label,name\n1,cube\n2,plate\n3,line\n")
     found = findings(tmp_path)
     assert list(found) == ["x.nii.gz#cube", "x.nii.gz#plate", "x.nii.gz#line"]
@@ -234,14 +224,7 @@ def test_the_thinnest_part_of_a_large_label_needs_little_memory():
 
 
 def test_a_body_that_is_not_in_its_file_is_told(tmp_path):
-    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
-    nibabel.save(
-        nibabel.Nifti1Image(
-            np.ones((9, 9, 9), dtype=np.uint8),
-            np.eye(4),
-        ),
-        tmp_path / "x.nii",
-    )
+    write_nifti(tmp_path / "x.nii", np.ones((9, 9, 9), dtype=np.uint8))
     (tmp_path / "labels.csv").write_text("file,body,label\nx.nii,x,a\nx.nii,liver,b\n")
     found = findings(tmp_path)
     assert found["x.nii#x"].error is None

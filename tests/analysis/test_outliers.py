@@ -10,6 +10,7 @@ from igps.analysis.groups import squared_distances
 from igps.analysis.outliers import LIMIT, flat_share, measure_bodies, outliers
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
+from label_files import write_nifti
 
 LABELS = ["a"] * 12 + ["b"] * 12
 
@@ -242,15 +243,10 @@ def test_measures_are_those_of_the_meshes(tmp_path):
 
 def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path):
     """Which its surface hides: a ball has as many faces on a grid that is twice as coarse."""
-    nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
     for name, side in (("fine", 1.0), ("coarse", 2.0)):
         places = (np.indices(3 * [int(40 / side)]) + 0.5) * side - 20
         mask = ((places**2).sum(axis=0) < 14**2).astype(np.uint8)
-        image = nibabel.Nifti1Image(
-            mask,
-            np.diag([side, side, side, 1]),
-        )
-        nibabel.save(image, tmp_path / f"{name}.nii.gz")
+        write_nifti(tmp_path / f"{name}.nii.gz", mask, np.diag([side, side, side, 1]))
     files = [tmp_path / "fine.nii.gz", tmp_path / "coarse.nii.gz"]
     dataset = SignatureDataset(files, cache_dir=tmp_path)
     spacing = measure_bodies(dataset, n_workers=1)["spacing"]
@@ -260,7 +256,6 @@ def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path):
 
 def test_labels_are_measured_in_their_grid(tmp_path):
     """Two balls that share a cap, one cut by a plane, one by the border of the volume, one with an island."""
-    nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
     x, y, z = np.indices((60, 40, 40))
 
     def ball(at, radius=10, height=20):
@@ -275,11 +270,7 @@ def test_labels_are_measured_in_their_grid(tmp_path):
         "island": island,
     }
     for name, mask in masks.items():
-        image = nibabel.Nifti1Image(
-            mask.astype(np.uint8),
-            np.eye(4),
-        )
-        nibabel.save(image, tmp_path / f"{name}.nii.gz")
+        write_nifti(tmp_path / f"{name}.nii.gz", mask.astype(np.uint8))
     files = [tmp_path / f"{name}.nii.gz" for name in masks]
     dataset = SignatureDataset(files, cache_dir=tmp_path, labels=["a", "b", "a", "c", "d"])
     found = measure_bodies(dataset, n_workers=1)
@@ -302,7 +293,6 @@ def test_labels_are_measured_in_their_grid(tmp_path):
 
 def test_labels_of_other_subjects_in_the_same_standard_space_do_not_overlap(tmp_path):
     """A file for each subject, all on the grid of an atlas: the ball of one lies in the block of the other."""
-    nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
     x, y, z = np.indices((40, 24, 24))
     for name, at in (("s1", 12), ("s2", 20)):
         labels = np.where(
@@ -311,11 +301,7 @@ def test_labels_of_other_subjects_in_the_same_standard_space_do_not_overlap(tmp_
             0,
         )
         labels[at + 9 :, 4:20, 4:20] = 2
-        image = nibabel.Nifti1Image(
-            labels.astype(np.uint8),
-            np.eye(4),
-        )
-        nibabel.save(image, tmp_path / f"{name}.nii.gz")
+        write_nifti(tmp_path / f"{name}.nii.gz", labels.astype(np.uint8))
     bodies = find_bodies(tmp_path, classes="body")
     assert bodies.labels == ("1", "2", "1", "2")
     found = measure_bodies(SignatureDataset(bodies, cache_dir=tmp_path), n_workers=1)

@@ -20,6 +20,7 @@ from igps.nn.description import describe
 from igps.report.figures import clusters_figure, map_figure, write_analysis
 from igps.retrieval import chi_square
 from igps.signature.signature import SignatureConfig
+from label_files import write_nifti
 from own_descriptors import SMALL, small_interior, write_egg
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
@@ -90,7 +91,6 @@ def test_groups_prints_and_writes_the_tests(root, tmp_path, capsys):
 
 def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(tmp_path):
     """Of eight subjects, the right egg is longer than the left one; only as pairs are they told apart so surely."""
-    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     place = np.indices((24, 60, 24)) - 12
     rows = ["file,body,side,subject"]
     for i in range(8):
@@ -102,7 +102,7 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(tmp_path)
             labels[inside] = label
             rows.append(f"s{i}.nii.gz,{label},{'left' if label == 17 else 'right'},{i}")
         (root := tmp_path / "brains").mkdir(exist_ok=True)
-        nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), root / f"s{i}.nii.gz")
+        write_nifti(root / f"s{i}.nii.gz", labels)
     (root / "labels.csv").write_text("\n".join(rows))
     words = ["--group", "side", "--strata", "subject", "--out", tmp_path / "found"]
     igps(root, "groups", root, *OWN, *words)
@@ -117,7 +117,6 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(tmp_path)
 @pytest.mark.parametrize("name", ["{group}{i}", "{i}", "case_{i}", "{word}"])
 def test_single_masks_in_a_folder_for_each_group_are_compared(name, tmp_path):
     """Masks named by their files count as one body; volumes of the groups do not overlap, so p is nearly minimal."""
-    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     place = np.indices((24, 24, 24)) - 12
     for group, side in (("patients", 6), ("controls", 8)):
         (folder := tmp_path / "masks" / group).mkdir(parents=True)
@@ -127,10 +126,7 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(name, tmp_path):
             ) ** 2 <= 1
             word = ("ann", "bob", "cid", "dan", "eve")[i]  # before and after, of the same subjects
             path = folder / f"{name.format(group=group, i=i, word=word)}.nii.gz"
-            nibabel.save(
-                nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)),
-                path,
-            )
+            write_nifti(path, inside.astype(np.uint8))
     words = ["--test_size", "--out", tmp_path / "found"]
     igps(tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
     _, size = json.loads((tmp_path / "found" / "groups.json").read_text())
@@ -245,7 +241,6 @@ def test_outliers_lists_the_short_egg_among_the_long_first(root, tmp_path, capsy
 @pytest.mark.parametrize("masks", [False, True])
 def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(masks, tmp_path):
     """The labels of a file, or the masks of a folder."""
-    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     random = default_rng(0)
     place = np.indices((40, 14, 14)) - 6.5
     for subject in range(10):
@@ -264,7 +259,7 @@ def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(masks, tmp_path)
             (path := tmp_path / "scans" / f"{name}.nii.gz").parent.mkdir(
                 parents=True, exist_ok=True
             )
-            nibabel.save(nibabel.Nifti1Image(voxels.astype(np.uint8), affine), path)
+            write_nifti(path, voxels.astype(np.uint8), affine)
     igps(
         tmp_path / "x",
         "outliers",
@@ -308,10 +303,8 @@ def test_explain_paints_the_voxels_in_which_an_attribute_differs(tmp_path, capsy
     generator = default_rng(0)
     for name, values in (("plain", np.zeros(label.shape)), ("bright", 1.0 * spot)):
         image = (values + 0.05 * generator.normal(size=label.shape)).astype(np.float32)
-        nibabel.save(nibabel.Nifti1Image(image, affine), tmp_path / f"{name}_ct.nii.gz")
-        nibabel.save(
-            nibabel.Nifti1Image(label.astype(np.uint8), affine), tmp_path / f"{name}.nii.gz"
-        )
+        write_nifti(tmp_path / f"{name}_ct.nii.gz", image, affine)
+        write_nifti(tmp_path / f"{name}.nii.gz", label.astype(np.uint8), affine)
     files = [tmp_path / "plain.nii.gz", tmp_path / "bright.nii.gz"]
     samples = ["--signature.n_eigenpairs", "50", "--signature.resolution", "14"]
     cache = ["--cache_dir", tmp_path / "cache", *SMALL, *samples, "--size", "ignore"]
@@ -334,7 +327,6 @@ def test_explain_paints_the_voxels_in_which_an_attribute_differs(tmp_path, capsy
 
 def test_explain_and_groups_paint_where_an_organ_differs(tmp_path, capsys):
     """Organ 1 has a knob on the patient's left in one group; organ 2 does not differ."""
-    nibabel = pytest.importorskip("nibabel")
     random = default_rng(0)
     world = np.stack(np.indices((32, 20, 36)), axis=-1) * 1.5 - 24.0
     rows = [("file", "diagnosis")]
@@ -352,8 +344,7 @@ def test_explain_and_groups_paint_where_an_organ_differs(tmp_path, capsys):
         other = (((world - [0.0, -9.0, 14.0]) / sizes) ** 2).sum(axis=-1) < 1
         labels = (organ | (knob & (i < 6))).astype(np.uint8) + 2 * other.astype(np.uint8)
         affine = np.diag([1.5, 1.5, 1.5, 1.0])
-        (tmp_path / "scans").mkdir(exist_ok=True)
-        nibabel.save(nibabel.Nifti1Image(labels, affine), tmp_path / "scans" / f"s{i}.nii.gz")
+        write_nifti(tmp_path / "scans" / f"s{i}.nii.gz", labels, affine)
         rows.append((f"s{i}.nii.gz", "ill" if i < 6 else "healthy"))
     with (tmp_path / "scans" / "labels.csv").open("w", newline="") as file:
         csv.writer(file).writerows(rows)

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 
 from commands import run
 from igps.signature.measures import POWERS
+from label_files import write_nifti
 from own_descriptors import SMALL
 
 nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
@@ -25,10 +26,7 @@ def root(tmp_path_factory):
         ] = 1
         labels[14:20, 5:12, 5 : 14 + i] = 2
         labels[22, 2:9, 2] = 3 * (i == 2)
-        nibabel.save(
-            nibabel.Nifti1Image(labels, np.diag([2.0, 2, 2, 1])),
-            folder / f"{i}.nii.gz",
-        )
+        write_nifti(folder / f"{i}.nii.gz", labels, np.diag([2.0, 2, 2, 1]))
         (folder / f"{i}.csv").write_text("label,name\n1,liver\n2,spleen\n3,heart\n")
     (folder / "labels.csv").write_text("file,age,body,label\n1.nii.gz,40,,well\n2.nii.gz,,,ill\n")
     return folder
@@ -112,7 +110,7 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path, capsys):
         for name, (a, b, c) in sides.items():
             mask = np.zeros((20, 20, 20), dtype=np.uint8)
             mask[2 : 2 + a, 2 : 2 + b, 2 : 2 + c] = 1
-            nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), folder / f"{name}.nii.gz")
+            write_nifti(folder / f"{name}.nii.gz", mask)
     rows = [
         f"{path.relative_to(tmp_path / 'masks')}"
         for path in sorted((tmp_path / "masks").rglob("*.nii.gz"))
@@ -149,7 +147,7 @@ def test_masks_that_are_numbered_have_a_row_each(tmp_path):
         (folder := tmp_path / "masks" / label).mkdir(parents=True, exist_ok=True)
         mask = np.zeros((12, 12, 12), dtype=np.uint8)
         mask[2 : 2 + side, 2:9, 2:9] = 1
-        nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), folder / f"{number}.nii.gz")
+        write_nifti(folder / f"{number}.nii.gz", mask)
     extract(tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     border = ["at_border", "border_sides"]
@@ -207,7 +205,7 @@ def test_plain_numbers_alone_need_no_eigenpairs_and_notes_stand_in_the_row(tmp_p
     mask = np.zeros((16, 16, 16), dtype=np.uint8)
     mask[2:11, 2:11, 2:11] = 1
     mask[14, 14, 14] = 1
-    nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), tmp_path / "cube.nii.gz")
+    write_nifti(tmp_path / "cube.nii.gz", mask)
     words = ["extract", tmp_path, "--out", tmp_path / "plain.csv", "--descriptor", "measures"]
     cache = ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
     monkeypatch.setattr("igps.spectra.eigenpairs", None)  # plain numbers need none

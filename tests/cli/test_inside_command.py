@@ -13,8 +13,7 @@ from igps.analysis.inside_collection import inside_config, inside_table
 from igps.data.attribute_sources import attribute_source
 from igps.data.dataset import SignatureDataset
 from igps.signature.signature import SignatureConfig
-
-nibabel = pytest.importorskip("nibabel", reason="images need nibabel")
+from label_files import write_nifti
 
 SMALL = ["--signature.n_surface_samples", "50"]
 AFFINE = np.diag([1.0, 1.0, 2.0, 1.0])
@@ -23,7 +22,7 @@ SHAPE = (20, 22, 14)
 
 def write(path, values):
     path.parent.mkdir(parents=True, exist_ok=True)
-    nibabel.save(nibabel.Nifti1Image(values, AFFINE), path)
+    write_nifti(path, values, AFFINE)
 
 
 def radius(scale):

@@ -13,6 +13,7 @@ from igps.report.page import render_page
 from igps.report.pictures import surfaces_of
 from igps.report.results import read_results, read_sources
 from igps.signature.signature import SignatureConfig
+from label_files import write_nifti
 from own_descriptors import SMALL, write_egg
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
@@ -149,16 +150,11 @@ def test_columns_of_the_labels_reach_the_page(root: Path, tmp_path: Path) -> Non
 
 
 def test_bodies_named_by_a_table_elsewhere_have_pictures(tmp_path: Path, here, monkeypatch) -> None:
-    nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((24, 16, 16), np.uint8)
     labels[2:8, 3:12, 3:12] = 1
     labels[11:22, 5:9, 5:9] = 2
     for subject in range(2):
-        (tmp_path / "scans").mkdir(exist_ok=True)
-        nibabel.save(
-            nibabel.Nifti1Image(labels[subject:], np.eye(4)),
-            tmp_path / "scans" / f"{subject}.nii.gz",
-        )
+        write_nifti(tmp_path / "scans" / f"{subject}.nii.gz", labels[subject:])
     (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')
     words = ["--classes", "body", "--names", "names.json", "--size", "ignore"]
     run(

@@ -18,6 +18,7 @@ from igps.mesh.loading import BodyRef, load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig, compute_signature
+from label_files import write_nifti
 
 CONFIG = SignatureConfig(n_eigenpairs=10, resolution=8, min_samples=0, n_surface_samples=20)
 OBJECTS = LoadOptions(mend="never", bodies="objects")
@@ -99,7 +100,6 @@ def test_the_class_is_the_folder_the_part_or_the_file(root):
 
 def test_an_empty_mask_among_organs_costs_no_other_its_class(tmp_path):
     """As TotalSegmentator writes them: a file for each organ, of which some are out of view."""
-    nibabel = pytest.importorskip("nibabel")
     for subject, organ, value in (
         ("s1", "liver", 1),
         ("s1", "spleen", 0),
@@ -108,8 +108,7 @@ def test_an_empty_mask_among_organs_costs_no_other_its_class(tmp_path):
     ):
         mask = np.zeros((14, 14, 14), dtype=np.uint8)
         mask[2:12, 3:10, 4:11] = value
-        (tmp_path / subject).mkdir(exist_ok=True)
-        nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), tmp_path / subject / f"{organ}.nii.gz")
+        write_nifti(tmp_path / subject / f"{organ}.nii.gz", mask)
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", classes="body")
     assert dataset.bodies.labels == ("liver", "spleen", "liver", "spleen")
     failures = dataset.precompute(n_workers=1, progress=False)
@@ -189,11 +188,10 @@ def test_a_table_of_columns_alone_tells_no_classes(root):
 
 def test_many_bodies_of_a_file_are_reported_some_at_a_time(tmp_path, reads):
     """Of 65 labels of a volume the first 64 are reported before the last is computed, for which it is read again."""
-    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     labels = np.zeros((65 * 7, 8, 8), dtype=np.uint8)
     for i in range(65):
         labels[7 * i + 1 : 7 * i + 6, 1:6, 1:6] = i + 1
-    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "cells.nii.gz")
+    write_nifti(tmp_path / "cells.nii.gz", labels)
     few = SignatureConfig(n_eigenpairs=5, resolution=4, min_samples=0, n_surface_samples=10)
     pipeline = SignatureDataset(tmp_path, few, tmp_path / "cache").pipeline
     outcomes = compute(
@@ -253,7 +251,6 @@ def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path):
 def test_what_is_read_beside_a_file_counts(tmp_path, trust_recent_files):
     """Two subjects whose headers are alike, a table of names that is put right, and numbers of a scene beside it."""
     sitk = pytest.importorskip("SimpleITK")
-    nibabel = pytest.importorskip("nibabel")
     labels = np.zeros((20, 20, 20), dtype=np.uint8)
     labels[2:8, 4:16, 4:16] = 1
     labels[10:18, 4:16, 4:16] = 2
@@ -273,8 +270,7 @@ def test_what_is_read_beside_a_file_counts(tmp_path, trust_recent_files):
     assert headers[0] == headers[1]
     assert volumes("meta") == {"s1/x.mhd#x": 864, "s2/x.mhd#x": 1152}
 
-    (tmp_path / "nifti").mkdir()
-    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "nifti" / "x.nii.gz")
+    write_nifti(tmp_path / "nifti" / "x.nii.gz", labels)
     for table, names in (("nifti/x.csv", None), ("names.csv", str(tmp_path / "names.csv"))):
         (tmp_path / table).write_text("label,name\n1,liver\n2,spleen\n")
         assert volumes("nifti", names) == {"x.nii.gz#liver": 864, "x.nii.gz#spleen": 1152}
@@ -395,7 +391,7 @@ def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(
         mask = np.zeros((10, 10, 10), dtype=np.uint8)
         mask[1 : 1 + n, 1 : 1 + n, 1 : 1 + n] = 1
         path = root / f"{name}.nii.gz"
-        nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), path)
+        write_nifti(path, mask)
         os.utime(path, (1e9, 1e9))
 
     def run():

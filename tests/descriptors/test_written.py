@@ -17,6 +17,7 @@ from igps.fields.volumes.image_attribute import ImageAttribute
 from igps.nn import fit_centres
 from igps.nn.description import describe
 from igps.retrieval import chi_square, retrieval_scores
+from label_files import write_nifti
 
 INTERIOR = """
 name: mine
@@ -175,7 +176,6 @@ def texture(kind, generator, points):
 
 
 def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp_path):
-    nibabel = pytest.importorskip("nibabel")
     generator = np.random.default_rng(0)
     affine = np.diag([0.1, 0.1, 0.1, 1.0])
     affine[:3, 3] = -1.5
@@ -190,8 +190,7 @@ def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp
             body.export(files[-1])
             values = texture(kind, generator, voxels.reshape(-1, 3)).reshape(31, 31, 31)
             place = tmp_path / "root" / "ct" / kind / f"{i}.off.nii.gz"
-            place.parent.mkdir(parents=True, exist_ok=True)
-            nibabel.save(nibabel.Nifti1Image(values.astype(np.float32), affine), place)
+            write_nifti(place, values.astype(np.float32), affine)
     images = {"ct": ImageAttribute("ct/{file}.nii.gz", tmp_path / "root")}
     found = {}
     labels = [path.parent.name for path in files]

@@ -24,6 +24,7 @@ from igps.duplicates.calibration import Calibration
 from igps.duplicates.compared_surfaces import Surfaces
 from igps.duplicates.duplicates import assigned, duplicates
 from igps.signature.signature import SignatureConfig
+from label_files import write_nifti
 
 PROJECT = Path(__file__).parents[2]
 CONFIG = descriptor("pretrained").requirements.apply_to(SignatureConfig())
@@ -173,28 +174,16 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
     turn[[0, 1, 2, 3], [1, 2, 0, 3]] = [-1, 1, 1, 1]
     turn[0, 3] = len(given) - 1
     inner = given[2:, 1:-1, 3:]
-    nibabel.save(
-        nibabel.Nifti1Image(given, np.eye(4)),
-        tmp_path / "given.nii.gz",
-    )
+    write_nifti(tmp_path / "given.nii.gz", given)
     nibabel.save(
         nibabel.MGHImage(given, np.eye(4)),
         tmp_path / "mgh.mgz",
     )
-    nibabel.save(
-        nibabel.Nifti1Image(given[::-1].transpose(2, 0, 1), turn),
-        tmp_path / "turned.nii",
-    )
+    write_nifti(tmp_path / "turned.nii", given[::-1].transpose(2, 0, 1), turn)
     shifted = np.eye(4)
     shifted[:3, 3] = (2, 1, 3)
-    nibabel.save(nibabel.Nifti1Image(inner, shifted), tmp_path / "cropped.nii")
-    nibabel.save(
-        nibabel.Nifti1Image(
-            labels(1.4),
-            np.diag([1.4, 1.4, 1.4, 1]),
-        ),
-        tmp_path / "sampled.nii",
-    )
+    write_nifti(tmp_path / "cropped.nii", inner, shifted)
+    write_nifti(tmp_path / "sampled.nii", labels(1.4), np.diag([1.4, 1.4, 1.4, 1]))
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     found = duplicates(dataset, n_workers=1)
     names = ("given.nii.gz", "mgh.mgz", "turned.nii", "cropped.nii")

@@ -21,6 +21,7 @@ from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.retrieval import chi_square
 from igps.signature.signature import SignatureConfig
+from label_files import write_nifti
 from own_descriptors import SMALL, small_interior
 
 INTERIOR = "own_descriptors:small_interior"
@@ -46,12 +47,6 @@ def root(tmp_path):
 @pytest.fixture
 def dataset(root, tmp_path):
     return SignatureDataset(root, CONFIG, tmp_path / "cache")
-
-
-def save_labels(path, labels):
-    nibabel = pytest.importorskip("nibabel")
-    path.parent.mkdir(exist_ok=True)
-    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), path)
 
 
 def block_and_bar():
@@ -380,7 +375,7 @@ def test_commands_that_change_a_gallery(root, tmp_path, capsys):
 
 def test_sync_notices_a_table_of_names_that_was_edited(tmp_path, trust_recent_files):
     """With its two names swapped the rows have the same names, and the bodies of each other."""
-    save_labels(tmp_path / "scans" / "scan.nii.gz", block_and_bar())
+    write_nifti(tmp_path / "scans" / "scan.nii.gz", block_and_bar())
     table = tmp_path / "names.json"
     table.write_text('{"1": "block", "2": "bar"}')
 
@@ -488,8 +483,8 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path):
     labels = block_and_bar()
     labels[11:22, 11:15, 5:9] = 3
     scan = tmp_path / "scans" / "scan.nii.gz"
-    save_labels(scan, labels)
-    save_labels(tmp_path / "scans" / "other.nii.gz", labels)
+    write_nifti(scan, labels)
+    write_nifti(tmp_path / "scans" / "other.nii.gz", labels)
     reading = LoadOptions(bodies="labels")
 
     def now():
@@ -513,7 +508,7 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path):
     assert failure.id == "scan.nii.gz"
     assert len(gallery) == 6
     labels[labels == 3] = 0
-    save_labels(scan, labels)
+    write_nifti(scan, labels)
     found = sync(gallery, now(), tmp_path / "scans", n_workers=1)
     assert found == (2, 1, [])
     found = sorted(row["part"] for row in gallery.rows("part"))
@@ -584,7 +579,7 @@ def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
 
 def test_a_gallery_remembers_the_table_of_names(tmp_path, here, capsys):
     """As how files are read; another one may be given, as where it was moved to."""
-    save_labels(tmp_path / "scans" / "scan.nii.gz", block_and_bar())
+    write_nifti(tmp_path / "scans" / "scan.nii.gz", block_and_bar())
     (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')
     (tmp_path / "other.json").write_text('{"1": "cube", "2": "bar"}')
     cache = ["--cache_dir", "cache", "--n_workers", 1]

@@ -2,7 +2,6 @@
 
 import zipfile
 
-import nibabel
 import numpy as np
 import pytest
 import trimesh
@@ -12,6 +11,7 @@ from tests.fields.cad.step_files import write_step
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import each_body, list_bodies, load_bodies, load_mesh, read_surface
 from igps.mesh.options import LoadOptions
+from label_files import write_nifti
 
 OBJECTS = LoadOptions(bodies="objects")
 PIECES = LoadOptions(bodies="pieces")
@@ -244,13 +244,7 @@ def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path
     labels[2:8, 2:14, 2:10] = 1
     labels[8:14, 2:14, 2:10] = 5
     labels[18, 18, 2:9] = 9
-    nibabel.save(
-        nibabel.Nifti1Image(
-            labels,
-            np.diag([1.0, 1.0, 2.0, 1.0]),
-        ),
-        tmp_path / "organs.nii.gz",
-    )
+    write_nifti(tmp_path / "organs.nii.gz", labels, np.diag([1.0, 1.0, 2.0, 1.0]))
     (tmp_path / "names.csv").write_text("label,name\n1,left\n5,right\n9,speck\n")
     path = tmp_path / "organs.nii.gz"
     options = LoadOptions(names=str(tmp_path / "names.csv"))

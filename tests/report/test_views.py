@@ -10,8 +10,8 @@ from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.report import drawing
 from igps.report.views import common_views, draw_view
+from label_files import write_nifti
 
-nibabel = pytest.importorskip("nibabel")
 SimpleITK = pytest.importorskip("SimpleITK")
 
 CENTRE = np.array([30.0, -40.0, 200.0])
@@ -43,7 +43,7 @@ def marked_ball(axes, toward):
 
 def write(path, voxels, affine):
     if path.name.endswith(".nii.gz"):
-        nibabel.save(nibabel.Nifti1Image(voxels, affine), path)
+        write_nifti(path, voxels, affine)
         return
     image = SimpleITK.GetImageFromArray(voxels.T)
     to_lps = np.diag([-1.0, -1, 1]) @ affine[:3, :3] / 1.5
@@ -122,8 +122,7 @@ def test_a_frame_is_claimed_only_where_the_file_has_one(tmp_path, header, frame)
     content = path.read_bytes().replace(b"space: left-posterior-superior", header.encode())
     path.write_bytes(content)
     assert load_mesh(path).frame == frame
-    unoriented = nibabel.Nifti1Image(voxels, None)
-    nibabel.save(unoriented, tmp_path / "body.nii")
+    write_nifti(tmp_path / "body.nii", voxels, None)
     assert load_mesh(tmp_path / "body.nii").frame is None
 
 

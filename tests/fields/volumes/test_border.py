@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 from commands import error_of, run
 from igps.fields.volumes.border import border_of
 from igps.fields.volumes.label_volume import LabelVolume, label_surface
-
-nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+from label_files import write_nifti
 
 N = 32
 RADIUS = 9.0
@@ -63,11 +62,7 @@ def test_no_whole_body_is_told_and_every_cut_one(tmp_path, capsys):
         "half": (16.0, 16.0, N),
     }
     for name, centre in {**whole, **cut}.items():
-        image = nibabel.Nifti1Image(
-            ball(centre).astype(np.uint8),
-            np.eye(4),
-        )
-        nibabel.save(image, tmp_path / f"{name}.nii.gz")
+        write_nifti(tmp_path / f"{name}.nii.gz", ball(centre).astype(np.uint8))
     out = tmp_path / "table.csv"
     words = ["--descriptor", "measures", "--cache_dir", tmp_path / "cache", "--n_workers", 1]
     run("extract", tmp_path, "--out", out, *words)

@@ -1,6 +1,5 @@
 """Tables of names that the package brings, and that names of labels compute nothing anew."""
 
-import nibabel
 import numpy as np
 import pytest
 
@@ -10,6 +9,7 @@ from igps.fields.volumes.label_names import BUILT_IN, read_label_names
 from igps.fields.volumes.label_volume import read_label_volume
 from igps.mesh.errors import MeshError
 from igps.mesh.options import LoadOptions
+from label_files import write_nifti
 
 SMALL = SignatureConfig(n_eigenpairs=10, min_samples=50, n_surface_samples=50)
 
@@ -24,7 +24,7 @@ def write(path, numbers):
         labels = labels.astype(np.uint16)
     for i, number in enumerate(numbers):
         labels[8 * i + 2 : 8 * i + 9 - i, 2:10, 2:10] = number
-    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), path)
+    write_nifti(path, labels)
 
 
 def names_in(path, names):

@@ -24,6 +24,7 @@ from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of
 from igps.mesh.loading import each_body, list_bodies, load_mesh
 from igps.mesh.options import LoadOptions
+from label_files import write_nifti
 
 nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
 sitk = pytest.importorskip("SimpleITK", reason="the extra [volumes]")
@@ -617,10 +618,7 @@ def test_probabilities_are_cut_at_the_threshold(tmp_path):
         axis=0,
     )
     shares = np.clip(1.5 - ball / 8, 0, 1).astype(np.float32)
-    nibabel.save(
-        nibabel.Nifti1Image(shares, np.eye(4)),
-        tmp_path / "x.nii",
-    )
+    write_nifti(tmp_path / "x.nii", shares)
     radius = {}
     for threshold in (0.5, 0.75):
         volume = read_label_volume(tmp_path / "x.nii", LoadOptions(threshold=threshold))
@@ -630,10 +628,7 @@ def test_probabilities_are_cut_at_the_threshold(tmp_path):
     expected = pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
     assert radius == expected
     shares = np.clip(0.9 - ball / 8, 0, 1).astype(np.float32)
-    nibabel.save(
-        nibabel.Nifti1Image(shares, np.eye(4)),
-        tmp_path / "y.nii",
-    )
+    write_nifti(tmp_path / "y.nii", shares)
     words = r"no voxel has a label, all are 0 \(probabilities: .* from 0\.95 on\)\. Check"
     with pytest.raises(MeshError, match=words):
         read_label_volume(tmp_path / "y.nii", LoadOptions(threshold=0.95))
@@ -680,10 +675,7 @@ def test_probabilities_may_overshoot(tmp_path):
     (tmp_path / "x.nii").write_bytes(header + bytes(4) + image.dataobj.tobytes(order="F"))
     assert np.asarray(nibabel.load(tmp_path / "x.nii").dataobj).max() > 1
     below = (share - 1e-6 * (share == 0)).astype(np.float32)
-    nibabel.save(
-        nibabel.Nifti1Image(below, np.eye(4)),
-        tmp_path / "y.nii",
-    )
+    write_nifti(tmp_path / "y.nii", below)
     for name in ("x.nii", "y.nii"):
         (body,) = read_label_volume(tmp_path / name).bodies
         assert body.n_voxels == (ball <= 8).sum()
@@ -691,7 +683,7 @@ def test_probabilities_may_overshoot(tmp_path):
 
 def test_large_labels_are_kept(tmp_path):
     labels = two_boxes().astype(np.int32) * 100_000_000
-    nibabel.save(nibabel.Nifti1Image(labels, AFFINE), tmp_path / "x.nii.gz")
+    write_nifti(tmp_path / "x.nii.gz", labels, AFFINE)
     volume = read_label_volume(tmp_path / "x.nii.gz")
     assert label_bodies(volume) == [
         (300_000_000, "300000000", 384),
@@ -702,7 +694,7 @@ def test_large_labels_are_kept(tmp_path):
 
 
 def nifti(path, values, affine=AFFINE):
-    nibabel.save(nibabel.Nifti1Image(values, affine), path)
+    write_nifti(path, values, affine)
 
 
 def cut_short(path):
