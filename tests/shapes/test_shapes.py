@@ -38,7 +38,10 @@ def surface_of(shape):
 
 
 def directed_edges(faces):
-    return [(int(f[i]), int(f[(i + 1) % 3])) for f in faces for i in range(3)]
+    edges = []
+    for a, b, c in faces.tolist():
+        edges += [(a, b), (b, c), (c, a)]
+    return edges
 
 
 def test_each_directed_edge_occurs_once_with_its_opposite(all_shapes):
