@@ -85,7 +85,7 @@ def examine(
     The surfaces of labels, and reasons why bodies cannot be used, are kept in the cache of the pipeline.
     """
     jobs = group_by_file(files, range(len(files)))
-    bodies = [[files[i] for i in job] for job in jobs]
+    bodies = [files.subset(job).refs for job in jobs]
     pipeline = replace(pipeline, needs_cache=False)
     outcomes = run(partial(_examine_file, pipeline), bodies, n_workers=n_workers, limits=limits)
     findings: dict[int, Finding] = {}

@@ -104,9 +104,10 @@ def explain(
     samples = _sample_shares(descriptor, pair, units, shares)
     if weights is None:
         weights = (dissimilarity(one, other), dissimilarity(other, one))
-    halves = [distance / 2 * own / own.sum() for own in weights]
-    places = (_on_surface(halves[0], samples[0]), _on_surface(halves[1], samples[1]))
-    return Explanation(distance, parts, samples, places)
+    half, other_half = (distance / 2 * own / own.sum() for own in weights)
+    on_first = _on_surface(half, samples[0])
+    on_second = _on_surface(other_half, samples[1])
+    return Explanation(distance, parts, samples, (on_first, on_second))
 
 
 def explain_bodies(

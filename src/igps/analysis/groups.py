@@ -226,7 +226,7 @@ def _permuted_traces(
     random: np.random.Generator,
 ) -> _Traces:
     count = n_permutations + 1
-    result = _Traces(np.empty(count), np.empty(count), np.empty(count), np.empty(count))
+    result = _Traces(*np.empty((4, count)))
     covariates = design.covariates @ design.covariates.T
     n_columns = design.nuisance.shape[1] + design.added.shape[1]
     block = max(1, _BLOCK // (len(gram) * n_columns))

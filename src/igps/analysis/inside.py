@@ -267,4 +267,6 @@ def _information(a: Integers, b: Integers) -> float:
     np.add.at(table, (a, b), 1 / len(a))
     independent = np.outer(table.sum(axis=1), table.sum(axis=0))
     present = table > 0
-    return float((table[present] * np.log2(table[present] / independent[present])).sum())
+    shares = table[present]
+    bits = np.log2(shares / independent[present])
+    return float((shares * bits).sum())

@@ -137,4 +137,5 @@ def _stress(distances: Floats, points: Floats) -> float:
     if not expected.any():
         return 0.0
     mapped = mapped * ((expected @ mapped) / max(float(mapped @ mapped), 1e-300))
-    return float(np.sqrt(np.square(expected - mapped).sum() / np.square(expected).sum()))
+    errors = np.square(expected - mapped).sum()
+    return float(np.sqrt(errors / np.square(expected).sum()))

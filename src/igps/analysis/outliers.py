@@ -204,13 +204,11 @@ def measure_bodies(dataset: SignatureDataset, *, n_workers: int | None = None) -
     """
     values = np.full((len(dataset), len(_MEASURED)), np.nan)
     places = list[Place | None]([None] * len(dataset))
-    jobs = group_by_file(
-        dataset.bodies, range(len(dataset)), -(-len(dataset) // (n_workers or n_cores()))
-    )
-    bodies = [[dataset.bodies[i] for i in job] for job in jobs]
-    with contextlib.closing(
-        run(partial(_measure_file, dataset.pipeline), bodies, n_workers=n_workers)
-    ) as outcomes:
+    max_per_job = -(-len(dataset) // (n_workers or n_cores()))
+    jobs = group_by_file(dataset.bodies, range(len(dataset)), max_per_job)
+    bodies = [dataset.bodies.subset(job).refs for job in jobs]
+    work = partial(_measure_file, dataset.pipeline)
+    with contextlib.closing(run(work, bodies, n_workers=n_workers)) as outcomes:
         for number, outcome in outcomes:
             for i, body in zip(jobs[number], bodies[number], strict=True):
                 if not isinstance(outcome, Failed) and body in outcome:
@@ -242,10 +240,9 @@ def flat_share(mesh: Mesh) -> float:
         order = np.argsort(heights)
         heights = heights[order]
         sums = np.append(0, np.cumsum(weights[order]))
-        largest = max(
-            largest,
-            float((sums[np.searchsorted(heights, heights + thickness, "right")] - sums[:-1]).max()),
-        )
+        ends = np.searchsorted(heights, heights + thickness, "right")
+        within = sums[ends] - sums[:-1]
+        largest = max(largest, float(within.max()))
     return largest / float(areas.sum())
 
 
@@ -349,8 +346,14 @@ def deviations_of(
     n = len(values)
     min_scatter = _MIN_SCATTER[name]
     is_known = np.isfinite(values)
-    members = [np.setdiff1d(np.flatnonzero(is_known & (codes == codes[i])), i) for i in range(n)]
-    usual = np.array([np.median(values[own]) if len(own) else np.nan for own in members])
+    members = []
+    usual = np.full(n, np.nan)
+    for i in range(n):
+        of_class = np.flatnonzero(is_known & (codes == codes[i]))
+        others = np.setdiff1d(of_class, i)
+        members.append(others)
+        if len(others):
+            usual[i] = np.median(values[others])
     differences = values - usual
     pooled = _scatter(differences[np.isfinite(differences)], min_scatter)
     centres = {
@@ -402,14 +405,15 @@ def _rare_repairs(notes: Sequence[Sequence[str]]) -> tuple[Floats, list[list[str
 
     A note is rare if fewer than a quarter of the bodies have it, whatever its numbers.
     """
-    kinds = [[_NUMBER.sub("", note) for note in notes_of_body] for notes_of_body in notes]
+    kinds = [_kinds(notes_of_body) for notes_of_body in notes]
     counts = Counter(kind for kinds_of_body in kinds for kind in set(kinds_of_body))
-    rare = [
-        [
-            note
-            for note, kind in zip(notes_of_body, kinds_of_body, strict=True)
-            if counts[kind] < len(notes) / 4
-        ]
-        for notes_of_body, kinds_of_body in zip(notes, kinds, strict=True)
-    ]
+    rare = []
+    for notes_of_body, kinds_of_body in zip(notes, kinds, strict=True):
+        pairs = zip(notes_of_body, kinds_of_body, strict=True)
+        rare.append([note for note, kind in pairs if counts[kind] < len(notes) / 4])
     return np.array([2.0 * len(rare_of_body) for rare_of_body in rare]), rare
+
+
+def _kinds(notes: Sequence[str]) -> list[str]:
+    """Return notes without their numbers."""
+    return [_NUMBER.sub("", note) for note in notes]

@@ -43,7 +43,9 @@ def _of_measures(dataset: SignatureDataset) -> dict[str, Tensor]:
         measures = Measures(size=size)
         if not measures.fit_collection(dataset.measures(), dataset.units()):
             return {}
-        rows = [[row.get(name, math.nan) for name in POWERS] for row in dataset.measures()]
+        rows = []
+        for row in dataset.measures():
+            rows.append([row.get(name, math.nan) for name in POWERS])
         columns = measures.logarithms(torch.tensor(rows, dtype=torch.float64), dataset.units())
         descriptions = columns / measures.spread
         found[measures.name] = euclidean(descriptions, descriptions)

@@ -66,7 +66,8 @@ def gap_root(mask: Booleans, sides: Floats) -> float:
     while mask.size > _MAX_VOXELS:
         mask = _halved(mask)
         sides = 2 * sides
-    depth = ndimage.distance_transform_edt(np.pad(mask, 1), sides).max()
+    depths = ndimage.distance_transform_edt(np.pad(mask, 1), sides)
+    depth = depths.max()
     radius = max(_CLOSING_RADIUS * depth, 1.01 * sides.min())
     margins = [int(radius / side) + 2 for side in sides]
     padded = np.pad(mask, [(margin, margin) for margin in margins])
