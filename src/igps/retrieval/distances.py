@@ -192,9 +192,15 @@ def square_root(values: Tensor) -> Tensor:
 
 
 def _unit(name: str, rows: Tensor) -> Tensor:
+    lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
+    limits = torch.finfo(rows.dtype)
+    is_traced = torch.compiler.is_compiling()  # traced code cannot depend on values of tensors
+    if not is_traced:
+        is_usual = (lengths > limits.tiny**0.25) & (lengths < limits.max**0.25)
+        if bool(is_usual.all()):
+            return rows / lengths
     # Divide by the largest entry first: the sum of squares of tiny or huge entries leaves the range of the dtype.
     largest = rows.detach().abs().amax(dim=1, keepdim=True)
-    is_traced = torch.compiler.is_compiling()  # traced code cannot depend on values of tensors
     n_empty = 0 if is_traced else (largest == 0).sum().item()
     if n_empty:
         raise ValueError(

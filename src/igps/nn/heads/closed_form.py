@@ -1,5 +1,6 @@
 """Heads fitted in closed form: within seconds, deterministically, without learning rates or stopping rules."""
 
+import math
 from collections.abc import Sequence
 from typing import Self
 
@@ -131,11 +132,9 @@ class WhitenedHead(Head):
         """Map histograms (N, ...) to embeddings (N, D) of length 1."""
         roots = square_roots(descriptions)
         if len(self.mean):
-            factors = self.part_shares.sqrt()
-            own = torch.cat(
-                [x * part for x, part in zip(factors, self.whitened_parts(roots), strict=True)],
-                dim=1,
-            )
+            lengths = self.part_shares.sqrt()
+            parts = zip(lengths, self.whitened_parts(roots), strict=True)
+            own = torch.cat([length * part for length, part in parts], dim=1)
         else:
             own = functional.normalize(roots, dim=1)
         if self.prior is None:
@@ -149,11 +148,12 @@ class WhitenedHead(Head):
             return cosine(queries, gallery)
         if not len(self.mean):
             raise self._not_fitted()
-        own, priors = zip(
-            *(x.tensor_split([len(self.mean)], dim=1) for x in (queries, gallery)), strict=True
-        )
-        prior_distances = self.prior.distances(*(x / self.prior_share.sqrt() for x in priors))
-        return (1 - self.prior_share) * cosine(*own) + self.prior_share * prior_distances
+        n_own = len(self.mean)
+        own = cosine(queries[:, :n_own], gallery[:, :n_own])
+        share = self.prior_share
+        length = share.sqrt()  # of the columns by the prior
+        others = self.prior.distances(queries[:, n_own:] / length, gallery[:, n_own:] / length)
+        return (1 - share) * own + share * others
 
     def whitened_parts(self, roots: Tensor) -> list[Tensor]:
         """Return the whitened unit vectors (N, cells) of each part, from the square roots (N, D) of histograms."""
@@ -243,22 +243,22 @@ class KernelHead(Head):
         else:
             self.whitened.centre(descriptions, part_cells)
         self.anchors = self._vectors(descriptions)
+        of_prior = []
+        if self.prior is not None:
+            of_prior = [self.prior_share if has_class_variation else 1.0]
         n_parts = len(self.whitened.part_cells)
-        share = 0.0 if self.prior is None else self.prior_share if has_class_variation else 1.0
-        shares = [(1 - share) / n_parts] * n_parts + ([] if self.prior is None else [share])
-        self.shares = self.anchors.new_tensor(shares)
-        i, j = torch.triu_indices(
-            len(self.anchors), len(self.anchors), 1, device=self.anchors.device
-        )
-        distances = self._distances(self.anchors)[:, i, j]
+        of_parts = [(1 - sum(of_prior)) / n_parts] * n_parts
+        self.shares = self.anchors.new_tensor([*of_parts, *of_prior])
+        distances = self._distances(self.anchors)
+        is_pair = torch.ones_like(distances[0], dtype=torch.bool).triu(1)
+        distances = distances[:, is_pair]
         self.medians = distances.median(dim=1).values.clamp_min(torch.finfo(distances.dtype).tiny)
         values, vectors = torch.linalg.eigh(self._kernel(self.anchors).double())
         factors = torch.where(values > 0, 1 / (values + self.ridge), 0)
         targets = functional.one_hot(members, len(self.classes)).double()
         # Contiguous as after loading from a file, so that products with them are rounded in the same way.
-        self.coefficients = (
-            (vectors * factors @ (vectors.T @ targets)).to(self.anchors.dtype).contiguous()
-        )
+        solution = vectors * factors @ (vectors.T @ targets)
+        self.coefficients = solution.to(self.anchors.dtype).contiguous()
         return self
 
     def scores(self, descriptions: Tensor) -> Tensor:
@@ -279,7 +279,8 @@ class KernelHead(Head):
         # With few shapes per class, the scores of other classes are nearly as large, so the temperature is raised.
         class_size = len(self.anchors) / len(self.classes)
         temperature = self.temperature * max(1, _MIN_CLASS_SIZE / class_size)
-        return torch.cat([similarity, (scores / temperature).softmax(dim=1).sqrt()], dim=1) / 2**0.5
+        class_roots = (scores / temperature).softmax(dim=1).sqrt()
+        return torch.cat([similarity, class_roots], dim=1) / math.sqrt(2)
 
     def _kernel(self, vectors: Tensor) -> Tensor:
         kernels = (-self._distances(vectors) / self.medians[:, None, None]).exp()
@@ -288,7 +289,9 @@ class KernelHead(Head):
     def _vectors(self, descriptions: Tensor) -> Tensor:
         """Return the unit vectors of the parts and of the prior, concatenated."""
         parts = self.whitened.whitened_parts(square_roots(descriptions))
-        return torch.cat(parts if self.prior is None else [*parts, self.prior(descriptions)], dim=1)
+        if self.prior is not None:
+            parts.append(self.prior(descriptions))
+        return torch.cat(parts, dim=1)
 
     def _distances(self, vectors: Tensor) -> Tensor:
         """Return distances (kernels, N, n_shapes) to the training shapes: cosine for each part, then the prior's."""
