@@ -21,6 +21,7 @@ import trimesh
 from sklearn.svm import SVC
 
 import commands
+import igps
 from igps.cli.commands import command_of, load_command
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES
@@ -146,11 +147,16 @@ def test_readme_is_short_and_has_its_example():
     assert len(python("README.md")) == 1
 
 
-def test_the_ten_lines_print_scores_and_the_nearest(folder, capsys):
+def test_the_twenty_lines_print_scores_and_the_nearest_and_train_a_layout(folder, capsys):
     example = python("README.md")[0].text
     (folder / "example.py").write_text(example)
-    assert len([line for line in example.splitlines() if line]) <= 10
-    runpy.run_path("example.py", run_name="__main__")
+    lines = [line for line in example.splitlines() if line and not line.startswith("#")]
+    assert len(lines) <= 20
+    made = runpy.run_path("example.py", run_name="__main__")
+    assert made["loss"].item() < np.log(2)  # by chance
+    start = igps.descriptor("interior", learnable=True).parameters()
+    for before, after in zip(start, made["model"].descriptor.parameters(), strict=True):
+        assert not np.allclose(before.tolist(), after.tolist(), rtol=0, atol=1e-3)
     scores, nearest = capsys.readouterr().out.splitlines()
     found = ast.literal_eval(scores)
     assert list(found) == SCORES
