@@ -16,10 +16,10 @@ from igps._arrays import Floats, Integers
 from igps._threads import one_thread
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import area_vectors, components, directed_edges, undirected_edges, unit
+from igps.mesh.surface import area_vectors, components, directed_edges, undirected_edges
 from igps.signature.voxels import interior_samples
 
-MEASURES_VERSION = 7
+MEASURES_VERSION = 8
 """Part of every cache key: raise it whenever the same mesh would give other numbers."""
 
 POWERS: Mapping[str, int] = {
@@ -62,9 +62,7 @@ _N_THICKNESS_STEPS = 16
 _LAST_STEP = 0.01
 _OPPOSITE = 0.05  # length of the sum of two unit vectors that are opposite to each other
 _LEAST_GROWTH = 1e-6  # more than rounding
-# Shares of the largest radius at which a ball counts as one of the largest, and as large
-_NEARLY_LARGEST = 0.995
-_LARGE = 0.9
+_LARGE = 0.9  # share of the largest radius from which a ball turns between two walls
 # Samples of the surface in which nearest points are looked for, over area³/volume², and their largest number: their
 # spacing is about a third of the thickness of a plate.
 _SAMPLES_PER_THICKNESS = 8
@@ -162,54 +160,75 @@ def local_thickness(mesh: Mesh, points: Floats) -> Floats:
     """
     surface = _NearestPoints(mesh)
     points = _even_selection(points)
-    points = points[surface.depths(points)[0] > 0]
-    if not len(points):
+    depths, away = surface.depths(points)
+    inside = depths > 0
+    if not inside.any():
         raise MeshError(
             f"{mesh.name}: expected points inside the body, got none. Give it some thickness."
         )
-    centres = points.copy()
-    radii, away = surface.depths(centres)
-    heading = surface.inward(centres)
-    step = np.maximum(radii, radii.max() - radii)
-    moving = np.arange(len(points))
+    balls = _Balls(points[inside], depths[inside], away[inside])
     for _ in range(_N_THICKNESS_STEPS):
-        ahead = heading[moving]
-        length = step[moving]
-        moved = centres[moving] + length[:, None] * ahead
-        radius, new_away = surface.depths(moved)
-        growth = radius - radii[moving]
-        contains_point = np.linalg.norm(moved - points[moving], axis=1) <= radius
-        is_larger = growth > _LEAST_GROWTH * radius
+        balls.grow(surface, balls.unfinished())
+    return balls.thickness()
+
+
+class _Balls:
+    """Balls in a body, each of which grows and keeps a point of its own inside."""
+
+    def __init__(self, points: Floats, depths: Floats, away: Floats) -> None:
+        self._points = points
+        self._centres = points.copy()
+        self._radii = depths
+        self._away = away  # unit vectors, from the nearest point of the surface
+        self._heading = away.copy()
+        self._step = np.maximum(depths, depths.max() - depths)
+
+    def unfinished(self) -> Integers:
+        """Return the balls that may still grow: the largest, and those whose point is not in the largest."""
+        largest = _first_largest(self._radii)
+        distances = _lengths(self._points - self._centres[largest])
+        in_largest = distances <= self._radii[largest]
+        in_largest[largest] = False
+        return np.flatnonzero(~in_largest & (self._step >= _LAST_STEP * self._radii))
+
+    def grow(self, surface: "_NearestPoints", balls: Integers) -> None:
+        """Move the centres of some balls a step ahead where a larger ball is there; shorten other steps."""
+        step = self._step[balls]
+        centres = self._centres[balls] + step[:, None] * self._heading[balls]
+        radii, away = surface.depths(centres)
+        is_larger = radii > (1 + _LEAST_GROWTH) * self._radii[balls]
+        contains_point = _lengths(centres - self._points[balls]) <= radii
         grows = is_larger & contains_point
-        # The length at which the walls behind and ahead are equally near, if both are flat
-        slope = _dots(away[moving], ahead)
-        new_slope = _dots(new_away, ahead)
-        level = (growth - length * new_slope) / np.maximum(slope - new_slope, 1e-9)
-        shorter = np.where(is_larger, length / 2, np.clip(level, 0, length / 2))
-        # In the middle between two walls, a ball can only grow along both; of large ones, which decide the greatest
-        # thickness, this is tried
-        along = away[moving] + new_away
-        turns = ~is_larger & (shorter < _LAST_STEP * radii[moving])
-        turns &= radii[moving] > _LARGE * radii.max()
-        turns &= np.linalg.norm(along, axis=1) > _OPPOSITE
-        shorter[turns] = radii[moving][turns] / 2
-        heading[moving[turns]] = unit(along[turns])
-        step[moving] = np.where(grows, radius / 2, shorter)
-        grown = moving[grows]
-        centres[grown] = moved[grows]
-        radii[grown] = radius[grows]
-        away[grown] = new_away[grows]
-        heading[grown] = unit(new_away[grows] + ahead[grows] / 2)
-        # No larger ball is to be found for a point of the largest
-        largest = _first_largest(radii)
-        in_largest = np.linalg.norm(points - centres[largest], axis=1) <= radii[largest]
-        is_done = in_largest | (radii >= _NEARLY_LARGEST * radii[largest])
-        is_done[grown] = False
-        is_done[largest] = False
-        is_done |= step < _LAST_STEP * radii
-        moving = moving[~is_done[moving]]
-    contains = cdist(points, centres) <= radii * (1 + 1e-9)
-    return 2 * np.where(contains, radii, 0).max(axis=1)
+        self._step[balls] = step / 2
+        self._meet(balls[~is_larger], radii[~is_larger], away[~is_larger])
+        grown = balls[grows]
+        self._centres[grown] = centres[grows]
+        self._radii[grown] = radii[grows]
+        self._away[grown] = away[grows]
+        self._heading[grown] = _unit(away[grows] + self._heading[grown] / 2)
+        self._step[grown] = radii[grows] / 2
+
+    def _meet(self, balls: Integers, radii: Floats, away: Floats) -> None:
+        """Aim where the walls behind and ahead are equally near; from there, along both."""
+        heading = self._heading[balls]
+        step = self._step[balls]
+        slope = _dots(self._away[balls], heading)
+        slope_ahead = _dots(away, heading)
+        growth = radii - self._radii[balls]
+        level = (growth - 2 * step * slope_ahead) / np.maximum(slope - slope_ahead, 1e-9)
+        step = np.clip(level, 0, step)
+        along = self._away[balls] + away
+        turns = step < _LAST_STEP * self._radii[balls]
+        turns &= self._radii[balls] > _LARGE * self._radii.max()
+        turns &= _lengths(along) > _OPPOSITE
+        step[turns] = self._radii[balls][turns] / 2
+        self._step[balls] = step
+        self._heading[balls[turns]] = _unit(along[turns])
+
+    def thickness(self) -> Floats:
+        """Return the diameter (N,) of the largest of all balls that contain each point."""
+        contains = cdist(self._points, self._centres) <= self._radii * (1 + 1e-9)
+        return 2 * np.where(contains, self._radii, 0).max(axis=1)
 
 
 def _even_selection(points: Floats) -> Floats:
@@ -220,7 +239,7 @@ def _even_selection(points: Floats) -> Floats:
 
 def _from_the_middle(points: Floats) -> Integers:
     """Return the order (P,) of points (P, 3) by their distance from their middle."""
-    distances = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    distances = _lengths(points - points.mean(axis=0))
     largest = max(distances.max(), np.finfo(float).tiny)  # a single point is the middle
     # Rounded, so that the order is that of a scaled body: its points are equally far from the middle but for rounding
     return np.argsort(np.round(distances / largest, 9), kind="stable")
@@ -229,6 +248,16 @@ def _from_the_middle(points: Floats) -> Integers:
 def _dots(first: Floats, second: Floats) -> Floats:
     """Return the products (N,) of vectors (N, 3)."""
     return np.einsum("ni,ni->n", first, second)
+
+
+def _lengths(vectors: Floats) -> Floats:
+    """Return the lengths (N,) of vectors (N, 3), in a quarter of the time of `np.linalg.norm`."""
+    return np.sqrt(_dots(vectors, vectors))
+
+
+def _unit(vectors: Floats) -> Floats:
+    """Return the vectors (N, 3) scaled to length 1; zero vectors stay zero."""
+    return vectors / np.maximum(_lengths(vectors), np.finfo(float).tiny)[:, None]
 
 
 def _first_largest(values: Floats) -> Integers:
@@ -253,15 +282,11 @@ class _NearestPoints:
         first = self._corners[:, 1] - self._corners[:, 0]
         second = self._corners[:, 2] - self._corners[:, 0]
         normal = np.cross(first, second)
-        squares = np.square(normal).sum(axis=1, keepdims=True)
+        squares = _dots(normal, normal)[:, None]
         # A row of a face times a point minus the first corner is the point's weight at the second or the third corner
         self._weights = np.stack([np.cross(second, normal), np.cross(normal, first)], axis=1)
         self._weights /= np.maximum(squares, np.finfo(float).tiny)[:, None]
-        self._normals = unit(normal)
-
-    def inward(self, points: Floats) -> Floats:
-        """Return the inward normals (P, 3) of the faces near points (P, 3), of use where no sample is as near."""
-        return -self._normals[self._tree.query(points)[1]]
+        self._normals = _unit(normal)
 
     def depths(self, points: Floats) -> tuple[Floats, Floats]:
         """Return the distances (P,) of points (P, 3) from the surface, negative outside, and the directions of growth.
@@ -271,12 +296,13 @@ class _NearestPoints:
         nearest = self._tree.query(points, _N_NEAREST)[1]
         corners = self._corners[nearest]
         offsets = points[:, None] - corners[:, :, 0]
-        others = (self._weights[nearest] @ offsets[..., None])[..., 0]
-        weights = np.concatenate([1 - others.sum(axis=2, keepdims=True), others], axis=2)
+        weights = np.empty((*nearest.shape, 3))
+        np.einsum("pkci,pki->pkc", self._weights[nearest], offsets, out=weights[..., 1:])
+        weights[..., 0] = 1 - weights[..., 1] - weights[..., 2]
         # A point of the face near the nearest, which may be outside of it
         weights = np.maximum(weights, 0)
-        weights /= weights.sum(axis=2, keepdims=True)
-        in_faces = (weights[:, :, None] @ corners)[:, :, 0]
+        weights /= np.einsum("pkc->pk", weights)[..., None]
+        in_faces = np.einsum("pkc,pkci->pki", weights, corners)
         candidates = np.concatenate([in_faces, self._samples[nearest[:, :1]]], axis=1)
         vectors = points[:, None] - candidates
         squared = np.einsum("pki,pki->pk", vectors, vectors)
@@ -284,8 +310,8 @@ class _NearestPoints:
         rows = np.arange(len(points))
         away = vectors[rows, best]
         normals = self._normals[nearest[rows, best % _N_NEAREST]]
-        side = np.where(_dots(away, normals) > 0, -1, 1)
-        return side * np.sqrt(squared[rows, best]), side[:, None] * unit(away)
+        depths = np.where(_dots(away, normals) > 0, -1, 1) * np.sqrt(squared[rows, best])
+        return depths, _unit(np.sign(depths)[:, None] * away)
 
 
 def _even_samples(mesh: Mesh, n_samples: int) -> tuple[Floats, Integers]:
@@ -295,7 +321,7 @@ def _even_samples(mesh: Mesh, n_samples: int) -> tuple[Floats, Integers]:
     gets its share by area, and is halved at its longest edge into as many pieces, whose centres are the samples.
     """
     corners = mesh.vertices[mesh.faces]
-    areas = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1)
+    areas = _lengths(area_vectors(mesh.vertices, mesh.faces))
     order = _from_the_middle(corners.mean(axis=1))
     ends = np.cumsum(areas[order]) * (n_samples / areas.sum())
     shares = np.diff(np.floor(ends), prepend=0)
@@ -332,7 +358,8 @@ def _moments(mesh: Mesh) -> tuple[Floats, Floats, Floats]:
     origin = mesh.vertices.mean(axis=0)
     corners = (mesh.vertices - origin)[mesh.faces]
     normals = np.cross(corners[:, 1], corners[:, 2])
-    shares = _dots(corners[:, 0], normals) / 6 / mesh.volume
+    six_volumes = _dots(corners[:, 0], normals)
+    shares = six_volumes / six_volumes.sum()
     sums = corners.sum(axis=1)
     mean = shares @ sums / 4
     vectors = np.concatenate([corners, sums[:, None]], axis=1).reshape(-1, 3)
@@ -351,10 +378,10 @@ def _diameter(corners: Floats) -> float:
     for _ in range(_N_DIAMETER_STEPS):
         along = directions @ corners.T
         ends = corners[along.argmax(axis=1)] - corners[along.argmin(axis=1)]
-        lengths = np.linalg.norm(ends, axis=1)
+        lengths = _lengths(ends)
         diameter = max(diameter, float(lengths.max()))
         widest = np.argsort(lengths)[-10:]
-        directions = unit(ends[widest])
+        directions = _unit(ends[widest])
     return diameter
 
 
@@ -364,14 +391,14 @@ def _total_mean_curvature(mesh: Mesh, edge_of: Integers) -> float:
     first = np.searchsorted(edge_of[by_edge], np.flatnonzero(np.bincount(edge_of) == 2))
     left = by_edge[first] // 3
     right = by_edge[first + 1] // 3
-    normals = unit(area_vectors(mesh.vertices, mesh.faces))
+    normals = _unit(area_vectors(mesh.vertices, mesh.faces))
     start, end = directed_edges(mesh.faces)
     side = by_edge[first]
     along = mesh.vertices[end[side]] - mesh.vertices[start[side]]  # as the left face goes round
-    sine = _dots(np.cross(normals[left], normals[right]), unit(along))
+    sine = _dots(np.cross(normals[left], normals[right]), _unit(along))
     cosine = _dots(normals[left], normals[right])
     angles = np.arctan2(sine, cosine)
-    return float(np.linalg.norm(along, axis=1) @ angles) / 2
+    return float(_lengths(along) @ angles) / 2
 
 
 def _euler_number(mesh: Mesh, edges: Integers, edge_of: Integers) -> float:
