@@ -1,9 +1,12 @@
 """Where on a body two groups differ: how far the surfaces of one group lie outside those of the other."""
 
+from __future__ import annotations
+
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,12 +17,15 @@ from igps._progress import Progress
 from igps._threads import one_thread
 from igps.analysis.alignment import rigid_motion
 from igps.analysis.groups import codes_of, design_of, permutations
-from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
 from igps.failures import Failed
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh, millimetres
 from igps.mesh.surface import vertex_areas
+
+if TYPE_CHECKING:
+    # Loads torch, which workers do without
+    from igps.data.dataset import SignatureDataset
 
 _MIN_SCALE = 1e-9  # of the scatter at a vertex, over the largest; with less nothing varies there
 

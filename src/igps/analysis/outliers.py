@@ -1,5 +1,7 @@
 """Outliers: bodies that are unlike their class, to check segmentations and labels before they are used."""
 
+from __future__ import annotations
+
 import contextlib
 import re
 from collections import Counter
@@ -7,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import NormalDist
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +26,6 @@ from igps.analysis.segmentation import (
     overlaps,
     stray_root,
 )
-from igps.data.dataset import SignatureDataset
 from igps.data.filling import group_by_file
 from igps.data.pipeline import SignaturePipeline
 from igps.failures import Failed
@@ -33,6 +35,10 @@ from igps.mesh.loading import BodyRef, each_raw_body, surface_body
 from igps.mesh.mesh import Mesh, millimetres
 from igps.mesh.raw_body import RawBody
 from igps.mesh.surface import area_vectors
+
+if TYPE_CHECKING:
+    # Loads torch, which workers do without
+    from igps.data.dataset import SignatureDataset
 
 _MEASURED = ("volume", "spacing", "handles", "flat", "stray", "cavity", "hole", "gap", "cut")
 

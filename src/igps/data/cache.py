@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import sys
 import time
 import zlib
 from collections.abc import Callable, Mapping
@@ -75,9 +76,10 @@ class Cache:
         return self._read(key, lambda file, texts: texts)
 
     def get(self, key: str, decode: Callable[[Record], T]) -> T | None:
-        """Return the value of a key, in views of the memory-mapped file; None if missing, or damaged (logged).
+        """Return the value of a key; None if missing, or damaged (logged).
 
-        `decode` converts the record to the value, and raises a ValueError, KeyError or TypeError if that fails.
+        `decode` converts the record to the value, and raises a ValueError, KeyError or TypeError if that fails. If
+        torch is loaded, arrays are views of the memory-mapped file.
         """
 
         def value(file: Any, texts: Mapping[str, str]) -> T:
@@ -88,8 +90,8 @@ class Cache:
                 raise ValueError("its content is damaged: it has another checksum")
             return decode(record)
 
-        # torch maps arrays without a copy, but takes a second to load, which small ones are not worth
-        framework = "numpy" if self.kind == "surface" else "pt"
+        # torch maps arrays without a copy, but takes a second to load
+        framework = "pt" if "torch" in sys.modules else "numpy"
         return self._read(key, value, framework)
 
     def _read(

@@ -1,12 +1,14 @@
 """Simplified surfaces for the page of results: few vertices, quantised, with the barycentroid potential."""
 
+from __future__ import annotations
+
 import contextlib
 import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,6 @@ from igps._arrays import Floats
 from igps._parallel import run
 from igps._progress import Progress
 from igps.data.cache import Record
-from igps.data.dataset import SignatureDataset
 from igps.data.keys import derived_key
 from igps.data.pipeline import SignaturePipeline
 from igps.failures import Failed
@@ -28,6 +29,10 @@ from igps.mesh.surface import longest_side
 from igps.report.drawing import axes_of
 from igps.report.views import patient_views
 from igps.signature.signature import Signature
+
+if TYPE_CHECKING:
+    # Loads torch, which workers do without
+    from igps.data.dataset import SignatureDataset
 
 logger = logging.getLogger(__name__)
 
