@@ -146,10 +146,11 @@ def _finding(ref: BodyRef, raw: RawBody, pipeline: SignaturePipeline, start: flo
     if raw.fault is not None:
         return _refused(finding, raw.fault)
     finding = replace(finding, n_vertices=len(raw.vertices))
-    try:
-        surface_body(raw, ref, replace(reading, mend="never"))
-    except MeshError as error:
-        finding = replace(finding, fault=str(error))
+    if voxels is None:  # the surface of a label was made closed
+        try:
+            surface_body(raw, ref, replace(reading, mend="never"))
+        except MeshError as error:
+            finding = replace(finding, fault=str(error))
     try:
         mesh = surface_body(raw, ref, reading, least_vertices=config.n_vertices_read)
     except MeshError as error:

@@ -19,7 +19,7 @@ from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
 from igps.analysis.superposition import Movement
 from igps.data.dataset import SignatureDataset
-from igps.mesh.loading import read_surface
+from igps.mesh.loading import each_raw_body
 from igps.mesh.mesh import Mesh
 from igps.report.drawing import (
     GREY,
@@ -189,8 +189,8 @@ def write_painted(
         ref = dataset.bodies[number]
         voxels = None
         if ref.path.is_file():
-            raw = read_surface(ref.path, dataset.reading, part=ref.part)
-            voxels = None if raw.voxels is None else raw.voxels()
+            for _, raw in each_raw_body(ref.path, dataset.reading, parts=[ref.part]):
+                voxels = None if raw.voxels is None else raw.voxels()
         write_places(out / stem, body.mesh, values, voxels, body.inside)
 
 

@@ -121,14 +121,13 @@ def _nibabel(path: Path) -> RawVolume:
     image: Any = nibabel.load(path)
     # Of compressed files, nibabel stops behind the last voxel
     if isinstance(image, nibabel.Nifti1Image) and path.suffix.lower() == ".gz":
-        n_bytes = max(image.get_data_dtype().itemsize, 1)
-        check_voxels(path, image.shape, 2 * n_bytes)  # for a moment, all values are held twice
+        n_bytes = _checked_bytes(image, path, n_copies=2)
         proxy: Any = image.dataobj
         with gzip.open(path) as stream:
             # At once: nibabel's own reading takes three times as long
-            content = stream.read(proxy.offset + math.prod(image.shape) * n_bytes)
+            content = stream.read(proxy.offset + n_bytes)
             check_rest(stream, path, n_more=_MAX_TAGS)
-        return of_nibabel(type(image).from_bytes(content), path)
+        return _volume_of(type(image).from_bytes(content))
     volume = of_nibabel(image, path)
     if path.suffix.lower() == ".mgz":
         (values,) = volume.layers
@@ -139,12 +138,23 @@ def _nibabel(path: Path) -> RawVolume:
 
 def of_nibabel(image: Any, path: str | Path) -> RawVolume:
     """Read an image of nibabel; `path` names it in messages."""
-    import nibabel
+    _checked_bytes(image, path)
+    return _volume_of(image)
 
+
+def _checked_bytes(image: Any, path: str | Path, n_copies: int = 1) -> int:
+    """Return the bytes of all voxels; a MeshError if they are no numbers, or so many copies do not fit into memory."""
     dtype = np.dtype(image.get_data_dtype())
     if dtype.fields or dtype.kind not in "biuf":
         raise _not_integers(path, f"{'colours' if dtype.fields else 'complex numbers'} ({dtype})")
-    check_voxels(path, image.shape, max(dtype.itemsize, 1))
+    check_voxels(path, image.shape, n_copies * max(dtype.itemsize, 1))
+    return math.prod(image.shape) * dtype.itemsize
+
+
+def _volume_of(image: Any) -> RawVolume:
+    """Read a checked image of nibabel."""
+    import nibabel
+
     values = np.asanyarray(image.dataobj).reshape(image.shape[:3])
     affine = np.array(image.affine, dtype=np.float64)
     names: dict[int, str] = {}
