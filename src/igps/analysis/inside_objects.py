@@ -1,7 +1,7 @@
 """Where inside bodies an image lies, for images and labels in memory."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -59,16 +59,15 @@ def inside(image: Any, label: Any, spacing: Sequence[float] | None = None) -> li
     images = {name: grid_of(one, spacing) for name, one in named.items()}
     labels = grid_of(label, spacing)
     _check_same_place(images, labels)
-    frame = _Frame.of(labels)
     config = inside_config(SignatureConfig())
-    volume = (labels.values, frame.spacing)
+    volume = (labels.values, tuple(_sides_of_voxel(labels).tolist()))
     bodies, meshes = bodies_in_memory({"label": volume}, None, LoadOptions(), config)
     rows: list[dict[str, Any]] = []
     errors: list[MeshError] = []
     for part, mesh in zip(bodies.parts, meshes.values(), strict=True):
         row = {**metadata, "label": part or "1"}
         try:
-            row |= _numbers(mesh, images, frame, config)
+            row |= _numbers(mesh, images, labels, config)
         except MeshError as error:
             errors.append(error)
             row |= dict.fromkeys(["volume", "area", *column_names(list(images))], np.nan)
@@ -79,27 +78,16 @@ def inside(image: Any, label: Any, spacing: Sequence[float] | None = None) -> li
     return rows
 
 
-@dataclass(frozen=True, eq=False)
-class _Frame:
-    """The frame in which the surfaces of labels are computed: along their axes, from the first voxel."""
-
-    labels: Grid
-    spacing: tuple[float, ...]
-
-    @staticmethod
-    def of(labels: Grid) -> "_Frame":
-        axes = labels.affine[:3, :3]
-        sides = np.linalg.norm(axes, axis=0)
-        cosines = (axes / sides).T @ (axes / sides) - np.eye(3)
-        if not np.abs(cosines).max() < _RIGHT_ANGLES:  # also if NaN
-            raise ValueError(
-                "label: expected voxels with right angles. Resample the labels to a grid without shear."
-            )
-        return _Frame(labels, tuple(sides.tolist()))
-
-    def to_world(self, points: Floats) -> Floats:
-        """Return the points (P, 3) of the world at points (P, 3) of the frame."""
-        return self.labels.to_world(points / self.spacing)
+def _sides_of_voxel(labels: Grid) -> Floats:
+    """Return the sides (3,) of a voxel; raise a ValueError unless the axes of the grid have right angles."""
+    axes = labels.affine[:3, :3]
+    sides = np.linalg.norm(axes, axis=0)
+    cosines = (axes / sides).T @ (axes / sides) - np.eye(3)
+    if not np.abs(cosines).max() < _RIGHT_ANGLES:  # also if NaN
+        raise ValueError(
+            "label: expected voxels with right angles. Resample the labels to a grid without shear."
+        )
+    return sides
 
 
 def _check_same_place(images: Mapping[str, Grid], labels: Grid) -> None:
@@ -114,12 +102,13 @@ def _check_same_place(images: Mapping[str, Grid], labels: Grid) -> None:
 
 
 def _numbers(
-    mesh: Mesh | MeshError, images: Mapping[str, Grid], frame: _Frame, config: SignatureConfig
+    mesh: Mesh | MeshError, images: Mapping[str, Grid], labels: Grid, config: SignatureConfig
 ) -> dict[str, Any]:
+    """Return the numbers of a body, whose mesh lies along the axes of the labels, from the first voxel."""
     if isinstance(mesh, MeshError):
         raise mesh
     signature = compute_signature(mesh, config)
-    places = frame.to_world(signature.interior.points)
+    places = labels.to_world(signature.interior.points / _sides_of_voxel(labels))
     values = {}
     for name, grid in images.items():
         values[name] = fill_missing(grid.at(places), places, f"{mesh.name}: {name}")
