@@ -73,6 +73,7 @@ class SignaturePipeline:
         """Return the cache of Signatures, attributes, descriptions or failures."""
         return Cache(self.cache_dir, kind)
 
+    @one_thread()
     def mesh(self, body: BodyRef, content: Content | None = None) -> Mesh:
         """Return the checked mesh of a body; raise a MeshError if it cannot be used."""
         if body in self.meshes:
