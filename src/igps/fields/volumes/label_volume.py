@@ -409,16 +409,6 @@ def label_bodies(
         volume = replace(volume, layers=(labelled,), names=None, segments=None)
         volume = _in_pieces(volume) if options.bodies == "pieces" else volume
     surface = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
-    if options.bodies == "whole":
-        return [
-            deferred(
-                partial(surface, 1),
-                None,
-                volume.unit,
-                partial(volume.voxels, 1),
-                volume.unit_from,
-            )
-        ]
     chosen = volume.bodies if part is None else (volume.body(part),)
     raw_bodies = []
     for body in chosen:
