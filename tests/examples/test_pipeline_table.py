@@ -73,6 +73,13 @@ def space(tmp_path_factory):
     return found
 
 
+@pytest.fixture
+def in_folder(space):
+    """The folder of the page as the current one."""
+    with contextlib.chdir(space["folder"]):
+        yield
+
+
 def test_there_are_twenty_things_that_work_and_reasons_for_the_rest():
     assert len(ROWS) >= 20
     numbers = [
@@ -89,19 +96,20 @@ def test_there_are_twenty_things_that_work_and_reasons_for_the_rest():
         assert ": " in line or "where" in line
 
 
+@pytest.mark.usefixtures("in_folder")
 @pytest.mark.parametrize("number", [number for number in ROWS if number != 4])
 def test_a_line_of_the_table_works(space, number, monkeypatch):
     monkeypatch.setattr("igps.data.dataset.default_cache_dir", lambda: space["folder"] / "cache")
     torch.compiler.reset()
     torch.manual_seed(0)
-    with contextlib.chdir(space["folder"]):
-        found = eval(ROWS[number][1], space)
+    found = eval(ROWS[number][1], space)
     if number in NOTHING_COMES_BACK:
         assert found is None
     else:
         assert CHECKS[number](found, space), ROWS[number][0]
 
 
+@pytest.mark.usefixtures("in_folder")
 def test_a_transform_is_set_and_taken_away(space):
     dataset = space["dataset"]
     whole = len(dataset[0].signature.interior)
