@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers
-from igps.descriptors.literature._geodesics import edge_graph, farthest_points
+from igps.descriptors.literature.geodesics import edge_graph, farthest_points
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import vertex_normals

@@ -1,4 +1,4 @@
-"""Atomic and reproducible writing of files, and reading of tables as spreadsheets save them."""
+"""Atomic and reproducible writing of files, and reading of text as spreadsheets and editors save it."""
 
 import codecs
 import contextlib

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from conftest import as_mesh
-from igps.mesh._isosurface import simplify_surface
 from igps.mesh.errors import MeshError
+from igps.mesh.isosurface import simplify_surface
 from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import simplify
 

@@ -12,8 +12,8 @@ from scipy import sparse
 
 from conftest import with_slivers
 from igps._threads import Team
-from igps.spectra._multifrontal import SingularMatrixError, analyse
-from igps.spectra._tree import BLOCK
+from igps.spectra.multifrontal import SingularMatrixError, analyse
+from igps.spectra.tree import BLOCK
 
 # A single block of all unknowns is not cut, with places or without
 SPLITS = [(4, False), (32, True), (10_000, True)]

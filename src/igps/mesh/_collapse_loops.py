@@ -8,6 +8,7 @@ import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers, Surface
 from igps._compiled import ALLOCATES, compiled
+from igps.mesh.surface import longest_side
 
 # Weight of the squared length of an edge in its cost. Without it, flat places get long thin triangles.
 _LENGTH_WEIGHT = 1e-2
@@ -33,9 +34,21 @@ class _Rings(NamedTuple):
     is_gone: Booleans
 
 
-@compiled(**ALLOCATES)
 def collapse_edges(vertices: Floats, faces: Integers, n_vertices: int) -> Surface:
     """Collapse the edges of a closed surface, cheapest first, until about `n_vertices` vertices are left.
+
+    It is scaled to unit size meanwhile, because quadrics are sums of squares.
+    """
+    centre = vertices.mean(axis=0)
+    scale = longest_side(vertices)
+    faces = np.ascontiguousarray(faces, dtype=np.int64)
+    points, triangles = collapse((vertices - centre) / scale, faces, n_vertices)
+    return points * scale + centre, triangles
+
+
+@compiled(**ALLOCATES)
+def collapse(vertices: Floats, faces: Integers, n_vertices: int) -> Surface:
+    """`collapse_edges` of a surface of unit size.
 
     The cost of a collapse is the sum of squared distances of the new vertex from the planes of the triangles that it
     replaces, weighted by their areas. Collapses that change the topology or turn a triangle over are left out.

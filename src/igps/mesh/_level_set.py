@@ -37,7 +37,8 @@ class Grid:
         shape = np.ceil((high - low) / cell).astype(int) + 1 + 2 * MARGIN
         # The grid is centred on the body, so that it moves with the body.
         origin = (low + high) / 2 - (shape - 1) / 2 * cell
-        return cls(origin, cell, (int(shape[0]), int(shape[1]), int(shape[2])))
+        n_x, n_y, n_z = shape.tolist()
+        return cls(origin, cell, (n_x, n_y, n_z))
 
     def to_cells(self, points: Floats) -> Floats:
         return (points - self.origin) / self.cell
@@ -58,7 +59,8 @@ def cell_sizes(
     sides = np.ptp(corners.reshape(-1, 3), axis=0)
     longest = float(sides.max())
     area = float(face_areas(vertices, faces).sum())
-    by_volume = float(np.prod(np.maximum(sides, longest / 1000)) ** (1 / 3)) / resolution
+    volume = float(np.prod(np.maximum(sides, longest / 1000)))
+    by_volume = volume ** (1 / 3) / resolution
     by_area = float(np.sqrt(area / (6 * resolution**2)))
     min_size = min(max(by_volume, by_area), longest / (0.8 * resolution))
     min_size = max(min_size, spacing)
@@ -109,7 +111,8 @@ def distances(
 
 def _all_combinations(axes: Sequence[Integers]) -> Integers:
     """Return all points (P, 3) of a grid with these coordinates along its axes."""
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    coordinates = np.meshgrid(*axes, indexing="ij")
+    return np.stack(coordinates, axis=-1).reshape(-1, 3)
 
 
 def level_set(
@@ -123,10 +126,12 @@ def level_set(
     at = np.nonzero(band)
     foot = nearest[at]
     height = distance[at]
-    normal = (np.stack(at, axis=1) - foot) / np.maximum(height, 1e-6)[:, None]
+    length = np.maximum(height, 1e-6)
+    normal = (np.stack(at, axis=1) - foot) / length[:, None]
     # A wall point belongs to the side beyond it, away from the surface; if only wall lies beyond, to the side of its
     # deepest neighbours.
-    markers = np.where(wall, 0, np.where(outside, 1, 2)).astype(np.int32)
+    sides = np.where(outside, 1, 2)
+    markers = np.where(wall, 0, sides).astype(np.int32)
     undecided = np.nonzero(height <= WALL)[0]
     for step in (0.75, 1.0, 1.25):
         side = _nearest_values(markers, foot[undecided] + step * normal[undecided])
@@ -162,7 +167,8 @@ def _is_solid(
 
 
 def _nearest_values(values: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
-    index = np.clip(np.round(points).astype(np.int64), 0, np.array(values.shape) - 1)
+    last = np.array(values.shape) - 1
+    index = np.clip(np.round(points).astype(np.int64), 0, last)
     return np.asarray(values[tuple(index.T)])
 
 
@@ -207,16 +213,19 @@ def join_pieces(field: Singles, notes: list[str], radius: float = 0.0) -> Single
         contacts.append([values[is_contact] for values in pairs])
     i, j, width, p, q = (np.concatenate(values) for values in zip(*contacts, strict=True))
     order = np.argsort(width, kind="stable")
-    pair = np.minimum(i, j).astype(np.int64) * (count + 1) + np.maximum(i, j)
+    smaller = np.minimum(i, j).astype(np.int64)
+    pair = smaller * (count + 1) + np.maximum(i, j)
     _, narrowest = np.unique(pair[order], return_index=True)
     chosen = order[narrowest]
-    graph = sparse.csr_array((width[chosen], (i[chosen], j[chosen])), shape=(count + 1,) * 2)
+    ends = (i[chosen], j[chosen])
+    graph = sparse.csr_array((width[chosen], ends), shape=(count + 1,) * 2)
     tree = sparse.csgraph.minimum_spanning_tree(graph).tocoo()
     lookup = {(int(i[k]), int(j[k])): k for k in chosen}
     nearest = index.reshape(3, -1).astype(np.float64)
-    for row, column in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
-        k = lookup[row, column]
-        _add_bar(field, nearest[:, p[k]], nearest[:, q[k]], max(radius, _MIN_BAR_RADIUS))
+    bar_radius = max(radius, _MIN_BAR_RADIUS)
+    for link in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
+        k = lookup[link]
+        _add_bar(field, nearest[:, p[k]], nearest[:, q[k]], bar_radius)
     notes.append(f"joined {len(pieces)} pieces by bars")
     return fill_bubbles(field)
 
@@ -224,10 +233,12 @@ def join_pieces(field: Singles, notes: list[str], radius: float = 0.0) -> Single
 def _add_bar(field: Singles, a: Floats, b: Floats, radius: float) -> None:
     around = math.ceil(radius) + 1
     low = np.maximum(np.minimum(a, b).astype(int) - around, 0)
-    high = np.minimum(np.maximum(a, b).astype(int) + around + 1, field.shape)
+    above = np.maximum(a, b).astype(int) + around + 1
+    high = np.minimum(above, field.shape)
     box = tuple(map(slice, low, high))
     from_a = np.moveaxis(np.indices(high - low), 0, -1) + low - a
     axis = b - a
-    along = np.clip((from_a @ axis) / max(float(axis @ axis), 1e-9), 0, 1)
+    squared_length = max(float(axis @ axis), 1e-9)
+    along = np.clip(from_a @ axis / squared_length, 0, 1)
     distance = np.linalg.norm(from_a - along[..., None] * axis, axis=-1)
     field[box] = np.minimum(field[box], distance - radius)

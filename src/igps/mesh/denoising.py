@@ -18,7 +18,15 @@ import numpy as np
 from scipy import sparse
 
 from igps._arrays import Floats, Integers
-from igps.mesh.surface import area_vectors, longest_side, undirected_edges, unit, vertex_normals
+from igps.mesh.surface import (
+    area_vectors,
+    dots,
+    edge_lengths,
+    longest_side,
+    undirected_edges,
+    unit,
+    vertex_normals,
+)
 
 # Thresholds are calibrated on generated shapes and parts of thin triangles, clean and with noise of 0.1 to 0.4 % of the
 # diagonal. Values of thin triangles are in brackets.
@@ -77,8 +85,9 @@ def is_noisy(vertices: Floats, faces: Integers) -> bool:
     averaging = around.averaging
     # Normals of the averaged surface, because noise larger than the triangles makes their own normals useless.
     normals = vertex_normals(averaging @ (averaging @ vertices), faces)
-    height = np.einsum("ij,ij->i", vertices - averaging @ vertices, normals)
-    residual = (height - averaging @ height) / np.maximum(around.length, np.finfo(float).tiny)
+    height = dots(vertices - averaging @ vertices, normals)
+    length = np.maximum(around.length, np.finfo(float).tiny)
+    residual = (height - averaging @ height) / length
     if np.quantile(np.abs(residual), 0.25) <= _MIN_ROUGHNESS:
         return False
     one_end = edges[:, 0]
@@ -107,8 +116,7 @@ class Neighbours:
         rows = edges.T.ravel()
         columns = edges[:, ::-1].T.ravel()
         degree = np.maximum(np.bincount(rows, minlength=n), 1)
-        edge_vectors = vertices[edges[:, 0]] - vertices[edges[:, 1]]
-        length = np.tile(np.linalg.norm(edge_vectors, axis=1), 2)
+        length = np.tile(edge_lengths(vertices, edges), 2)
         weights = np.ones(len(rows))
         mean_length = np.bincount(rows, weights=length, minlength=n) / degree
         inverse_squares = np.maximum(length, _MIN_LENGTH) ** -2.0
@@ -120,13 +128,15 @@ class Neighbours:
             weights = inverse_squares
             mean_length = near_length
         total = np.bincount(rows, weights=weights, minlength=n)
-        averaging = sparse.csr_array((weights / total[rows], (rows, columns)), shape=(n, n))
+        shares = weights / total[rows]
+        averaging = sparse.csr_array((shares, (rows, columns)), shape=(n, n))
         return cls(edges, edge_of, averaging, mean_length, stretch)
 
     @property
     def faces_at_sides(self) -> Integers:
         """(F, 3) number of faces that share the side from each corner to the next."""
-        return np.asarray(np.bincount(self.edge_of)[self.edge_of].reshape(-1, 3))
+        n_faces = np.bincount(self.edge_of)
+        return np.asarray(n_faces[self.edge_of].reshape(-1, 3))
 
 
 def remove_noise(vertices: Floats, faces: Integers) -> Floats:
@@ -176,7 +186,7 @@ def _filter_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats
             weights = (incidence[part] @ incidence.T).tocsr()
             here = np.repeat(guide[part], np.diff(weights.indptr), axis=0)
             # Half the squared difference of two unit vectors is 1 minus their product.
-            half_squares = 1 - np.einsum("ij,ij->i", here, guide[weights.indices])
+            half_squares = 1 - dots(here, guide[weights.indices])
             weights.data = size[weights.indices] * np.exp(-half_squares / _WIDTH**2)
             means[part] = weights @ normals
         normals = unit(means)
@@ -193,7 +203,7 @@ def _fit_to_normals(vertices: Floats, faces: Integers, normals: Floats, free: Fl
     share = free / n_faces[:, None]
     for _ in range(_N_STEPS):
         # The mean projection, on their normals, of the vectors to the centroids of the faces around
-        heights = np.einsum("ij,ij->i", normals, vertices[faces].mean(axis=1))
+        heights = dots(normals, vertices[faces].mean(axis=1))
         to_centroids = to_vertices @ (heights[:, None] * normals)
         to_vertex = np.einsum("vij,vj->vi", projections, vertices)
         vertices = vertices + share * (to_centroids - to_vertex)
@@ -215,8 +225,9 @@ def noise_and_edge(vertices: Floats, faces: Integers, around: Neighbours) -> tup
     """
     normals = vertex_normals(around.averaging @ (around.averaging @ vertices), faces)
     high_pass = (sparse.eye_array(len(vertices), format="csr") - around.averaging).tocsr()
-    residual = high_pass @ np.einsum("ij,ij->i", high_pass @ vertices, normals)
-    white_noise = np.sqrt(np.asarray((high_pass @ high_pass).power(2).sum(axis=1)))
+    residual = high_pass @ dots(high_pass @ vertices, normals)
+    squares = (high_pass @ high_pass).power(2)
+    white_noise = np.sqrt(np.asarray(squares.sum(axis=1)))
     noise = np.quantile(np.abs(residual) / white_noise, 0.25) / _QUARTILE
     edge = np.sqrt(np.mean(around.length**2))
     return float(noise), float(max(edge, np.finfo(float).tiny))

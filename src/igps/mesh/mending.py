@@ -6,7 +6,7 @@ and `repair_steps` returns the repairs that notes record.
 
 import logging
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, get_args
 
@@ -110,8 +110,9 @@ def mend(
                 f"{name}: expected a surface, but all faces lie in one point. Check the file."
             )
         check_size(corners.reshape(-1, 3), name)  # before squares of lengths overflow or vanish
-        repair = _remake if how == "always" else _mend
-        mesh = repair(vertices, triangles, name, cavities == "keep", denoise)
+        mending = _Mending(name, cavities == "keep", denoise)
+        repair = mending.remade if how == "always" else mending.mended
+        mesh = repair(vertices, triangles)
     _, is_outer = mesh.outer()
     n_outer = int(is_outer.sum())
     if n_outer < least_vertices:
@@ -132,31 +133,70 @@ def repair_steps(notes: Iterable[str]) -> tuple[Step, ...]:
     return tuple(found)
 
 
-def _mend(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
-    notes: list[str] = []
-    original = vertices, faces
-    drop_hidden = partial(drop_hidden_parts, cavities=cavities)
-    for step in (None, weld, tidy, fill_small_holes, drop_hidden):
-        if step is not None and len(faces):
-            vertices, faces = step(vertices, faces, notes)
-        body = _body(vertices, faces, notes, name, cavities, denoise)
+@dataclass(frozen=True)
+class _Mending:
+    """Ways to make a body of the triangles of a surface; for the fields see `mend`."""
+
+    name: str
+    cavities: bool
+    denoise: bool
+
+    def mended(self, vertices: Floats, faces: Integers) -> Mesh:
+        """Return the body after as few repairs as possible."""
+        notes: list[str] = []
+        original = vertices, faces
+        drop_hidden = partial(drop_hidden_parts, cavities=self.cavities)
+        for step in (None, weld, tidy, fill_small_holes, drop_hidden):
+            if step is not None and len(faces):
+                vertices, faces = step(vertices, faces, notes)
+            body = self._body(vertices, faces, notes)
+            if body is not None:
+                return body
+        # These steps may give no body if there are many loose parts; their result is then discarded.
+        if len(faces):
+            with_walls = list(notes)
+            body = self._body(*drop_inner_walls(vertices, faces, with_walls), with_walls)
+        if body is None:
+            united: list[str] = []
+            body = self._body(*unite_parts(*original, united), united)
         if body is not None:
             return body
-    # These steps may give no body if there are many loose parts; their result is then discarded.
-    for step, surface, earlier in (
-        (drop_inner_walls, (vertices, faces), notes),
-        (unite_parts, original, []),
-    ):
-        if not len(surface[1]):
-            continue
-        record = list(earlier)
-        points, triangles = step(*surface, record)
-        body = _body(points, triangles, record, name, cavities, denoise)
-        if body is not None:
-            return body
-    body = watertight(_smooth(vertices, faces, notes, denoise), faces, name=name)
-    notes += _open_notes(vertices, faces, body.volume)
-    return body.annotated(notes=tuple(notes))
+        body = watertight(self._smooth(vertices, faces, notes), faces, name=self.name)
+        notes += _open_notes(vertices, faces, body.volume)
+        return body.annotated(notes=tuple(notes))
+
+    def remade(self, vertices: Floats, faces: Integers) -> Mesh:
+        """Return the welded and smooth body, watertight only if that is no body, or one that crosses itself."""
+        notes: list[str] = []
+        surface = vertices, faces
+        # The grid is the last resort: it would join parts that are nearer than a cell, such as the coils of a spring.
+        for step in (None, weld):
+            if step is not None:
+                surface = step(vertices, faces, notes)
+            body = self._body(*surface, notes)
+            if body is not None and not crosses_itself(body.vertices, body.faces):
+                return body
+            notes = []
+        smooth = self._smooth(*surface, notes)
+        last = (smooth, surface[1]) if notes else (vertices, faces)
+        return watertight(*last, name=self.name).annotated(notes=tuple(notes))
+
+    def _body(self, vertices: Floats, faces: Integers, notes: list[str]) -> Mesh | None:
+        """Return the body with this surface, smoothed if it is noisy, or None if the surface bounds no body."""
+        try:
+            mesh = Mesh(vertices, faces, name=self.name, notes=tuple(notes), cavities=self.cavities)
+        except MeshError:
+            return None
+        smooth = self._smooth(mesh.vertices, mesh.faces, notes)
+        if smooth is mesh.vertices:
+            return mesh
+        return replace(mesh, vertices=smooth, notes=tuple(notes))
+
+    def _smooth(self, vertices: Floats, faces: Integers, notes: list[str]) -> Floats:
+        if not self.denoise or not len(faces) or not is_noisy(vertices, faces):
+            return vertices
+        notes.append("smoothed: the surface was rough with noise")
+        return remove_noise(vertices, faces)
 
 
 def _open_notes(vertices: Floats, faces: Integers, volume: float) -> list[str]:
@@ -169,42 +209,3 @@ def _open_notes(vertices: Floats, faces: Integers, volume: float) -> list[str]:
         return []
     share = f"open: {missing:.0%} of the surface is missing"
     return [f"{share}, so it became a shell around {inside:.3g}; close it if it is a solid body"]
-
-
-def _body(
-    vertices: Floats, faces: Integers, notes: list[str], name: str, cavities: bool, denoise: bool
-) -> Mesh | None:
-    """Return the body with this surface, smoothed if it is noisy, or None if the surface bounds no body."""
-    try:
-        mesh = Mesh(vertices, faces, name=name, notes=tuple(notes), cavities=cavities)
-    except MeshError:
-        return None
-    smooth = _smooth(mesh.vertices, mesh.faces, notes, denoise)
-    if smooth is mesh.vertices:
-        return mesh
-    return replace(mesh, vertices=smooth, notes=tuple(notes))
-
-
-def _remake(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
-    """Weld and smooth a surface, and make it watertight only if that gives no body, or one that crosses itself."""
-    notes: list[str] = []
-    surface = vertices, faces
-    # The grid is the last resort: it would join parts that are nearer than a cell, such as the coils of a spring.
-    for step in (None, weld):
-        if step is not None:
-            surface = step(vertices, faces, notes)
-        body = _body(*surface, notes, name, cavities, denoise)
-        if body is not None and not crosses_itself(body.vertices, body.faces):
-            return body
-        notes = []
-    smooth = _smooth(*surface, notes, denoise)
-    last = (smooth, surface[1]) if notes else (vertices, faces)
-    body = watertight(*last, name=name)
-    return body.annotated(notes=tuple(notes))
-
-
-def _smooth(vertices: Floats, faces: Integers, notes: list[str], denoise: bool) -> Floats:
-    if not denoise or not len(faces) or not is_noisy(vertices, faces):
-        return vertices
-    notes.append("smoothed: the surface was rough with noise")
-    return remove_noise(vertices, faces)

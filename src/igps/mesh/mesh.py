@@ -30,11 +30,19 @@ logger = logging.getLogger(__name__)
 Frame = Literal["RAS"] | None
 """Axes of a patient (x to the right, y to the front, z up), or None if they are not known."""
 
+_PREFIXES = {"": 1e3, "centi": 10.0, "milli": 1.0, "micro": 1e-3, "nano": 1e-6}
+_WRITTEN_OUT = {
+    f"{prefix}{ending}": length
+    for prefix, length in _PREFIXES.items()
+    for ending in ("meter", "meters", "metre", "metres")
+}
 MILLIMETRES: Mapping[str, float] = {
     "m": 1e3,
     "cm": 10.0,
     "mm": 1.0,
     "µm": 1e-3,
+    "\u03bcm": 1e-3,  # with the Greek letter, not the sign of micro
+    "\\u00B5m": 1e-3,
     "um": 1e-3,
     "micron": 1e-3,
     "microns": 1e-3,
@@ -45,15 +53,7 @@ MILLIMETRES: Mapping[str, float] = {
     "inches": 25.4,
     "ft": 304.8,
     "feet": 304.8,
-    "meter": 1e3,
-    "meters": 1e3,
-    "centimeters": 10.0,
-    "millimeter": 1.0,
-    "millimeters": 1.0,
-    "micrometer": 1e-3,
-    "micrometers": 1e-3,
-    "\\u00B5m": 1e-3,
-    "\u03bcm": 1e-3,  # the second with the Greek letter, not the sign of micro
+    **_WRITTEN_OUT,
 }
 """Length of units in millimetres, by the names that bodies carry."""
 
@@ -61,14 +61,6 @@ MILLIMETRES: Mapping[str, float] = {
 def millimetres(unit: str | None) -> float:
     """Return the length of a unit in millimetres, 1 if the unit is unknown."""
     return MILLIMETRES.get(unit or "mm", 1.0)
-
-
-_PREFIXES = {"": 1e3, "centi": 10.0, "milli": 1.0, "micro": 1e-3, "nano": 1e-6}
-_WRITTEN_OUT = {
-    f"{prefix}{ending}": length
-    for prefix, length in _PREFIXES.items()
-    for ending in ("meter", "meters", "metre", "metres")
-}
 
 
 def unit_of_length(name: str) -> float | None:
@@ -79,10 +71,7 @@ def unit_of_length(name: str) -> float | None:
         (0.001, 1e-06, None)
     """
     name = name.strip()
-    if name in MILLIMETRES:
-        return MILLIMETRES[name]
-    lower = name.lower()
-    return _WRITTEN_OUT.get(lower, MILLIMETRES.get(lower))
+    return MILLIMETRES.get(name, MILLIMETRES.get(name.lower()))
 
 
 _REPAIR = 'LoadOptions(mend="auto"), on the command line --mend auto,'

@@ -3,7 +3,7 @@
 import numpy as np
 
 from igps._arrays import Floats, Integers
-from igps.mesh.surface import sums
+from igps.mesh.surface import dots, sums
 
 # Larger polygons are cut into fans: ear clipping takes quadratic time or worse.
 _MAX_EAR_CORNERS = 2000
@@ -47,7 +47,9 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
     has_area = n_corners >= 3
     corners = corners[np.repeat(has_area, n_corners)]
     n_corners = n_corners[has_area]
-    if n_corners.max(initial=0) < 4 or corners.min() < 0 or corners.max() >= len(vertices):
+    if n_corners.max(initial=0) < 4:
+        return triangles(corners, n_corners)
+    if corners.min() < 0 or corners.max() >= len(vertices):
         return triangles(corners, n_corners)
     starts = np.cumsum(n_corners) - n_corners
     owner = np.repeat(np.arange(len(n_corners)), n_corners)
@@ -58,8 +60,8 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
     in_fan = np.cross(vertices[corners] - vertices[first], vertices[following] - vertices[first])
     total = sums(owner, in_fan, len(n_corners))
     with np.errstate(invalid="ignore"):  # coordinates that are not finite are refused later
-        along_total = np.einsum("ij,ij->i", in_fan, total[owner])
-        squared = np.einsum("ij,ij->i", total, total)
+        along_total = dots(in_fan, total[owner])
+        squared = dots(total, total)
         is_flipped = along_total < -1e-9 * squared[owner]
     is_folded = np.zeros(len(n_corners), dtype=bool)
     is_folded[owner[is_flipped]] = True
@@ -85,7 +87,9 @@ def _clip_ears(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
         others = vertices[[k for k in remaining if k not in (a, b, c)]]
         # On which side of each side of the triangle the other corners lie, (n, 3)
         beside = np.cross(sides, others[:, None] - triangle) @ normal
-        if np.cross(sides[0], sides[1]) @ normal > 0 and not (beside >= 0).all(axis=1).any():
+        is_convex = np.cross(sides[0], sides[1]) @ normal > 0
+        is_empty = not (beside >= 0).all(axis=1).any()
+        if is_convex and is_empty:
             ears.append((a, b, c))
             del remaining[at]
             at = at % len(remaining)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers
+from igps._files import table_text
 from igps._text import counted
 from igps.mesh._tidying import are_specks, places
 from igps.mesh.errors import MeshError
@@ -158,12 +158,5 @@ def distinct(names: Iterable[str]) -> list[str]:
 
 
 def text_of(path: Path) -> str:
-    """Read a file as UTF-8, as UTF-16 with its mark, or else as Latin-1; carriage returns become line feeds."""
-    content = path.read_bytes()
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        content = content.decode("utf-16", "replace").encode()
-    content = content.replace(b"\r", b"\n")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("latin-1")
+    """Return the text of a file, see `table_text`, with line feeds in place of carriage returns."""
+    return table_text(path).replace("\r", "\n")

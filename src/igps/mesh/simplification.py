@@ -9,7 +9,7 @@ from igps._parameters import check_at_least
 from igps.mesh._collapse_loops import collapse_edges
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import longest_side, undirected_edges
+from igps.mesh.surface import edge_lengths, longest_side, undirected_edges
 
 
 def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
@@ -25,19 +25,14 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     surplus = len(mesh.vertices) - max_vertices
     if surplus <= 0:
         return mesh
-    # In unit size, because quadrics are sums of squares.
-    centre = mesh.vertices.mean(axis=0)
-    scale = longest_side(mesh.vertices)
-    points = (mesh.vertices - centre) / scale
     if mesh.allow_open:
-        points, faces = _simplified_open(points, mesh.faces, surplus)
+        vertices, faces = _simplified_open(mesh, surplus)
     else:
-        points, faces = collapse_edges(points, mesh.faces, max_vertices)
-    if len(points) > max_vertices:
-        fault = f"{mesh.name}: simplification reached only {len(points)} vertices, expected {max_vertices}"
+        vertices, faces = collapse_edges(mesh.vertices, mesh.faces, max_vertices)
+    if len(vertices) > max_vertices:
+        fault = f"{mesh.name}: simplification reached only {len(vertices)} vertices, expected {max_vertices}"
         raise MeshError(f"{fault}; fewer would change the topology. Raise max_vertices.")
-    note = f"simplified from {len(mesh.vertices)} to {len(points)} vertices"
-    vertices = points * scale + centre
+    note = f"simplified from {len(mesh.vertices)} to {len(vertices)} vertices"
     try:
         return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))
     except MeshError as error:
@@ -46,14 +41,17 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
         ) from error
 
 
-def _simplified_open(points: Floats, faces: Integers, surplus: int) -> Surface:
+def _simplified_open(mesh: Mesh, surplus: int) -> Surface:
     """Collapse edges of a surface that may have a boundary, until `surplus` vertices fewer are left."""
     import igl
 
+    centre = mesh.vertices.mean(axis=0)
+    scale = longest_side(mesh.vertices)
+    points = np.asfortranarray((mesh.vertices - centre) / scale)
     # A collapse removes a vertex and two faces
-    n_faces = max(len(faces) - 2 * surplus, 4)
-    points, faces, *_ = igl.qslim(np.asfortranarray(points), np.asfortranarray(faces), n_faces)
-    return points, faces
+    n_faces = max(len(mesh.faces) - 2 * surplus, 4)
+    points, faces, *_ = igl.qslim(points, np.asfortranarray(mesh.faces), n_faces)
+    return points * scale + centre, faces
 
 
 def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
@@ -65,7 +63,7 @@ def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
     faces = mesh.faces
     while len(vertices) < n_vertices:
         edges, edge_of_side = undirected_edges(faces, len(vertices))
-        length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+        length = edge_lengths(vertices, edges)
         # A pass cuts only edges about as long as the longest, so that edges are cut in the order of their lengths.
         longest = np.argsort(-length, kind="stable")[: n_vertices - len(vertices)]
         cut = longest[length[longest] > 0.7 * length.max()]

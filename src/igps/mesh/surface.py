@@ -14,7 +14,9 @@ _FLAT = 2.0**-26  # triangles of at most this height over length count as flat
 
 def area_vectors(vertices: Floats, faces: Integers) -> Floats:
     """Return the unit normal of each face times its area: (F, 3), length²."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    a = vertices[faces[:, 0]]
+    b = vertices[faces[:, 1]]
+    c = vertices[faces[:, 2]]
     return np.cross(b - a, c - a) / 2
 
 
@@ -26,7 +28,8 @@ def face_areas(vertices: Floats, faces: Integers) -> Floats:
 def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
     """Return a third of the area of the faces around each vertex: (V,), length²."""
     third = np.repeat(face_areas(vertices, faces) / 3, 3)
-    return np.asarray(np.bincount(faces.ravel(), third, len(vertices)), dtype=np.float64)
+    areas = np.bincount(faces.ravel(), third, len(vertices))
+    return np.asarray(areas, dtype=np.float64)
 
 
 def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
@@ -37,13 +40,26 @@ def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
 
 def sums(index: Integers, rows: Floats, n: int) -> Floats:
     """Return the sums (n, D) of the rows (R, D) with each index (R,)."""
-    return np.stack([np.bincount(index, column, n) for column in rows.T], axis=1)
+    columns = [np.bincount(index, column, n) for column in rows.T]
+    return np.stack(columns, axis=1)
+
+
+def dots(first: Floats, second: Floats) -> Floats:
+    """Return the products (N,) of vectors (N, 3) with others."""
+    return np.einsum("ij,ij->i", first, second)
+
+
+def edge_lengths(vertices: Floats, edges: Integers) -> Floats:
+    """Return the lengths (E,) of edges (E, 2)."""
+    start = vertices[edges[:, 0]]
+    end = vertices[edges[:, 1]]
+    return np.linalg.norm(end - start, axis=1)
 
 
 def mean_of_neighbours(vertices: Floats, faces: Integers) -> Floats:
     """Return the mean (V, 3) of each vertex's neighbours, weighted by inverse squared distance, length."""
     ends = undirected_edges(faces, len(vertices))[0]
-    squares = np.square(vertices[ends[:, 0]] - vertices[ends[:, 1]]).sum(axis=1)
+    squares = np.square(edge_lengths(vertices, ends))
     # Coincident vertices get a large weight, without a division by zero.
     weights = 1 / np.maximum(squares, 1e-12 * squares.mean())
     total = np.zeros(len(vertices))
@@ -138,7 +154,8 @@ def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
 def signed_volume(vertices: Floats, faces: Integers) -> float:
     """Return the enclosed volume, length³, negative if inside out; for an open surface, of its cone over the centre."""
     centred = vertices - vertices.mean(axis=0)
-    return float(np.einsum("ij,ij->", centred[faces[:, 0]], area_vectors(centred, faces)) / 3)
+    bases = area_vectors(centred, faces)
+    return float(np.einsum("ij,ij->", centred[faces[:, 0]], bases) / 3)
 
 
 def compact(vertices: Floats, faces: Integers) -> Surface:
@@ -150,7 +167,8 @@ def compact(vertices: Floats, faces: Integers) -> Surface:
 def connected(vertices: Floats, faces: Integers) -> list[Surface]:
     """Return the connected components as surfaces, in the order of their first vertices."""
     count, component = components(faces, len(vertices))
-    return [compact(vertices, faces[component[faces[:, 0]] == k]) for k in range(count)]
+    of_face = component[faces[:, 0]]
+    return [compact(vertices, faces[of_face == k]) for k in range(count)]
 
 
 def largest(vertices: Floats, faces: Integers) -> Surface:
@@ -175,5 +193,6 @@ def has_area(corners: Floats) -> Booleans:
     """Return whether triangles with corners (F, 3, 3) have an area, beyond rounding errors: (F,)."""
     sides = corners - np.roll(corners, 1, axis=1)
     longest = (sides**2).sum(axis=2).max(axis=1)
-    double_areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    normals = np.cross(sides[:, 0], sides[:, 1])
+    double_areas = np.linalg.norm(normals, axis=1)
     return np.asarray(double_areas > _FLAT * longest)

@@ -20,7 +20,6 @@ from scipy.spatial import cKDTree
 from igps._arrays import Floats, Integers
 from igps._parameters import check_at_least
 from igps._text import counted
-from igps.mesh._isosurface import level_surface, simplify_surface
 from igps.mesh._level_set import (
     Grid,
     cell_sizes,
@@ -31,6 +30,7 @@ from igps.mesh._level_set import (
 )
 from igps.mesh._outside import OrientedSurface, find_outside
 from igps.mesh.errors import MeshError
+from igps.mesh.isosurface import level_surface, simplify_surface
 from igps.mesh.mesh import Mesh, check_coordinates
 from igps.mesh.surface import diagonal, face_areas, largest, longest_side, unit
 

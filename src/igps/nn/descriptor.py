@@ -273,12 +273,16 @@ class HistogramDescriptor(Descriptor):
         self.source = source
         self.invariant_to = tuple(invariant_to)
         flat = [histogram for group in groups for histogram in group]
-        n_read = zip(*(histogram.n_read(training=False) for histogram in flat), strict=True)
-        is_read = dict(zip(SAMPLE_KINDS, map(max, n_read), strict=True))
+        n_read = zip(SAMPLE_KINDS, self._n_read(training=False), strict=True)
         self.requirements = replace(
             reduce(or_, (histogram.requirements for histogram in flat)),
-            samples=tuple(kind for kind in SAMPLE_KINDS if is_read[kind]),
+            samples=tuple(kind for kind, n in n_read if n > 0),
         )
+
+    def _n_read(self, training: bool) -> tuple[float, float]:
+        """Return the largest numbers of interior and surface samples of a body that are read."""
+        read = [histogram.n_read(training) for part in self.parts for histogram in part]
+        return max(n for n, _ in read), max(n for _, n in read)
 
     @property
     def parts(self) -> tuple[tuple[DescriptionPart, ...], ...]:
@@ -330,11 +334,10 @@ class HistogramDescriptor(Descriptor):
                 [share * histogram(features).flatten(1) for share, histogram in shares], dim=1
             )
 
-        n_read = zip(*(part.n_read(self.training) for _, part in shares), strict=True)
-        interior, surface = map(max, n_read)
+        n_read = self._n_read(self.training)
 
         def described(bodies: SignatureBatch) -> Tensor:
-            return batches.map_by_size(concatenated, bodies, (interior, surface))
+            return batches.map_by_size(concatenated, bodies, n_read)
 
         return on_one_thread(described, batch, self)
 

@@ -144,9 +144,7 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int) -> PageSurface
     vertices = mesh.vertices
     faces = mesh.faces
     if len(vertices) > n_vertices:
-        scale = longest_side(vertices)
-        vertices, faces = collapse_edges(vertices / scale, faces, n_vertices)
-        vertices = vertices * scale
+        vertices, faces = collapse_edges(vertices, faces, n_vertices)
     if len(vertices) > _STEPS:  # fewer would close handles; a face has two bytes for a corner
         raise MeshError(f"{mesh.name}: too many handles to simplify its surface for the page.")
     samples = signature.surface.points

@@ -103,7 +103,8 @@ class HatSurface:
         ones = np.ones(n_corners)
         starts = np.arange(n_corners + 1)
         shape = (len(vertices), n_corners)
-        incidence = sparse.csc_matrix((ones, self.faces.ravel(), starts), shape=shape).tocsr()
+        incidence = sparse.csc_matrix((ones, self.faces.ravel(), starts), shape=shape)
+        incidence = incidence.tocsr()
         self.hats = _hats(vertices, incidence, corners, normals, double_areas / 6, squared_sides)
         self.face_starts = incidence.indptr.astype(np.int64)
         self.incident_faces = incidence.indices.astype(np.int64) // 3
@@ -160,9 +161,12 @@ def _hats(
     centres = (vertices + total) / 4
     to_vertex = vertices - centres
     mixed = _outer(vertices, total)
-    hat_moments = (2 * _outer(vertices, vertices) + mixed + mixed.transpose(0, 2, 1) + moments) / 20
+    own = 2 * _outer(vertices, vertices)
+    hat_moments = (own + mixed + mixed.transpose(0, 2, 1) + moments) / 20
     covariance = hat_moments - _outer(centres, centres)
-    normal_moments = normal_moments.reshape(-1, 3, 3) / 4 + _outer(flux, vertices / 4 - centres)
+    shifts = vertices / 4 - centres
+    normal_moments = normal_moments.reshape(-1, 3, 3) / 4
+    normal_moments = normal_moments + _outer(flux, shifts)
     trace = np.trace(covariance, axis1=1, axis2=2)[:, None]
     # At each corner, the longer of its two sides
     one_side = np.roll(squared_sides, -1, axis=1)
@@ -171,7 +175,8 @@ def _hats(
     extents = np.maximum.reduceat(longest[incidence.indices], incidence.indptr[:-1])
     radii = extents[:, None] + np.linalg.norm(to_vertex, axis=1, keepdims=True)
     constant = (flux * to_vertex).sum(axis=1, keepdims=True)
-    linear = -4 * np.einsum("vij,vi->vj", normal_moments, to_vertex) - 2 * trace * flux
+    tilted = np.einsum("vij,vi->vj", normal_moments, to_vertex)
+    linear = -4 * tilted - 2 * trace * flux
     parts = [
         centres,
         radii,
@@ -230,7 +235,8 @@ class HatClusters:
 
         def fill(level: int) -> None:
             size = sizes[level]
-            terms = _cluster_terms(hats, size, centres[level], radii[level]).astype(functions.dtype)
+            terms = _cluster_terms(hats, size, centres[level], radii[level])
+            terms = terms.astype(functions.dtype)
             starts = range(0, n_hats, size)
             for cluster, start in enumerate(starts, start=level_starts[level]):
                 part = slice(start, start + size)
@@ -269,7 +275,9 @@ def _cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats) -> F
     second = _trace(first) * _SQUARES - 4 * first
     g = 2 * _trace(tilt) * s + _trace(spread) * flux
     g += 4 * _times(tilt, s) + 2 * _times(spread, flux)
-    third = 12 * _cubic(flux, spread) + 24 * _cubic(s, tilt) - 2 * _cubic(g, _SQUARES[None])
+    third = 12 * _cubic(flux, spread)
+    third += 24 * _cubic(s, tilt)
+    third -= 2 * _cubic(g, _SQUARES[None])
     return np.concatenate([flux, second, third], axis=1)
 
 

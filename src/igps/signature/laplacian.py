@@ -51,9 +51,11 @@ def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_ma
 def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:
     corners = mesh.vertices[mesh.faces]
     # Column i is the edge opposite corner i.
-    edges = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
+    following = np.roll(corners, -1, axis=1)
+    edges = np.roll(corners, -2, axis=1) - following
     squared = np.einsum("fij,fij->fi", edges, edges)
-    double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    normals = np.cross(edges[:, 0], edges[:, 1])
+    double_area = np.linalg.norm(normals, axis=1)
     is_thin = double_area <= _MIN_THICKNESS * squared.max(axis=1)
     if is_thin.any():
         # Intrinsic mollification (Sharp and Crane 2020) of the degenerate faces alone: the cotangent matrix stays
@@ -63,7 +65,8 @@ def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:
         squared[is_thin] = lengths**2
         double_area[is_thin] = 2 * _areas_by_lengths(lengths)
     # cot at corner i = (b·b + c·c − a·a) / (4 area), where a is the edge opposite corner i.
-    cotangents = (squared.sum(axis=1, keepdims=True) - 2 * squared) / (2 * double_area[:, None])
+    differences = squared.sum(axis=1, keepdims=True) - 2 * squared
+    cotangents = differences / (2 * double_area[:, None])
     n_vertices = len(mesh.vertices)
     mass = _mixed_voronoi_mass(mesh.faces, cotangents, squared, double_area / 2, n_vertices)
     return _stiffness(mesh.faces, cotangents, n_vertices), mass

@@ -8,12 +8,15 @@ All contributions are positive, so it also bounds the relative error of the sum.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
 from igps._arrays import Floats, Integers
 from igps._compiled import compiled
 from igps.mesh.surface import longest_side
+
+Vector = tuple[float, float, float]
 
 # Of a face, relative to its longest side: flatter faces have no numerical normal
 _MIN_HEIGHT = 1e-14
@@ -36,7 +39,7 @@ def surface_potential(
     corners = corners[_relative_heights(corners) > _MIN_HEIGHT]
     x = np.ascontiguousarray((np.asarray(points, np.float64) - centre).T / scale)
     potentials = np.zeros(x.shape[1])
-    _fill_potentials(x, _series(corners, accuracy), _face_table(corners), potentials)
+    _fill_potentials(x, _series(corners, accuracy), corners, potentials)
     return potentials * scale
 
 
@@ -56,43 +59,37 @@ def _series(corners: Floats, accuracy: float) -> Floats:
     """
     centres = corners.mean(axis=1)
     arms = corners - centres[:, None]
-    normals = np.cross(arms[:, 0] - arms[:, 1], arms[:, 0] - arms[:, 2])
+    first = arms[:, 0] - arms[:, 1]
+    second = arms[:, 0] - arms[:, 2]
+    normals = np.cross(first, second)
     areas = np.linalg.norm(normals, axis=1, keepdims=True) / 2
     covariances = arms.transpose(0, 2, 1) @ arms / 12
     variances = np.trace(covariances, axis1=1, axis2=2)
     radii = np.linalg.norm(arms, axis=2).max(axis=1)
     # With d = g + R/2, d² (d − R) = (g + R/2)² (g − R/2) ≥ g³ for g ≥ R.
-    bounds = np.maximum(np.cbrt(radii * variances / accuracy), 1.5 * radii)
+    bounds = np.cbrt(radii * variances / accuracy)
+    bounds = np.maximum(bounds, 1.5 * radii)
     limits = np.square(bounds + radii / 2)
-    forms = 1.5 * covariances - 0.5 * variances[:, None, None] * np.eye(3)
+    round_parts = variances[:, None, None] * np.eye(3)
+    forms = 1.5 * covariances - 0.5 * round_parts
     entries = forms[:, (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)] * [1, 1, 1, 2, 2, 2]
     return np.concatenate([centres, limits[:, None], areas, areas * entries], axis=1)
 
 
-def _face_table(corners: Floats) -> Floats:
-    """Return corners, normal, outward side normals, side lengths and twice the area of each triangle as (F, 25)."""
-    sides = np.roll(corners, -1, axis=1) - corners  # from each corner to the next
-    normals = np.cross(sides[:, 0], sides[:, 1])
-    double_areas = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals / double_areas
-    lengths = np.linalg.norm(sides, axis=2)
-    outward = np.cross(sides / lengths[..., None], normals[:, None])
-    columns = [corners.reshape(-1, 9), normals, outward.reshape(-1, 9), lengths, double_areas]
-    return np.concatenate(columns, axis=1)
-
-
 @compiled()
-def _fill_potentials(points: Floats, series: Floats, faces: Floats, sums: Floats) -> None:
-    """Add the potentials of all faces, given by their series (F, 11) and tables (F, 25), at points (3, n)."""
+def _fill_potentials(points: Floats, series: Floats, corners: Floats, sums: Floats) -> None:
+    """Add the potentials of all faces, with their series (F, 11) and corners (F, 3, 3), at points (3, n)."""
     for face in range(len(series)):
-        _add_series(series[face], points, sums)
         row = series[face]
+        _add_series(row, points, sums)
         for i in range(points.shape[1]):
-            a = row[0] - points[0, i]
-            b = row[1] - points[1, i]
-            c = row[2] - points[2, i]
-            if a * a + b * b + c * c < row[3]:
-                sums[i] += _near_potential(faces[face], points[0, i], points[1, i], points[2, i])
+            point = (points[0, i], points[1, i], points[2, i])
+            arm = _to(row, point)
+            if _dot(arm, arm) < row[3]:
+                a = _to(corners[face, 0], point)
+                b = _to(corners[face, 1], point)
+                c = _to(corners[face, 2], point)
+                sums[i] += _near_potential(a, b, c)
 
 
 @compiled()
@@ -121,37 +118,58 @@ def _add_series(row: Floats, points: Floats, sums: Floats) -> None:
 
 
 @compiled()
-def _near_potential(face: Floats, x: float, y: float, z: float) -> float:
-    """Return the potential of a face (25,) at a point, in closed form.
+def _near_potential(a: Vector, b: Vector, c: Vector) -> float:
+    """Return the potential of a face at a point, by the vectors from the point to its corners, in closed form.
 
-    It is −|h Ω| + Σ p ln((r + r' + l)/(r + r' − l)), summed over the sides. For a side of length l, p is the distance
-    of the point's projection from the line of the side, positive inside, and r, r' are the distances of the point from
-    its ends. The height h is the distance of the point from the plane, and Ω the solid angle of the face (Van Oosterom
-    and Strackee 1983). On a side, p and the denominator both vanish: the term is 0.
-
-    The entries of a face are its corners, its normal, the outward normals of its sides in its plane, the lengths of its
-    sides, and twice its area.
+    It is −|h Ω| + Σ p ln((r + r' + l)/(r + r' − l)), summed over the sides, see `_side`. The height h is the distance
+    of the point from the plane, and Ω the solid angle of the face (Van Oosterom and Strackee 1983).
     """
-    a = (face[0] - x, face[1] - y, face[2] - z)
-    b = (face[3] - x, face[4] - y, face[5] - z)
-    c = (face[6] - x, face[7] - y, face[8] - z)
-    r = math.sqrt(_dot(a, a))
-    s = math.sqrt(_dot(b, b))
-    t = math.sqrt(_dot(c, c))
-    potential = _dot((face[12], face[13], face[14]), a) * _logarithm(r + s, face[21])
-    potential += _dot((face[15], face[16], face[17]), b) * _logarithm(s + t, face[22])
-    potential += _dot((face[18], face[19], face[20]), c) * _logarithm(t + r, face[23])
-    height = abs(_dot((face[9], face[10], face[11]), a))
-    denominator = r * s * t + _dot(a, b) * t + _dot(b, c) * r + _dot(c, a) * s
-    return potential - 2 * height * math.atan2(height * face[24], denominator)
+    normal = _cross(_to(b, a), _to(c, a))
+    double_area = _length(normal)
+    sides = _side(a, b, normal) + _side(b, c, normal) + _side(c, a, normal)
+    r = _length(a)
+    s = _length(b)
+    t = _length(c)
+    volume = abs(_dot(normal, a))
+    denominator = r * s * t
+    denominator += _dot(a, b) * t
+    denominator += _dot(b, c) * r
+    denominator += _dot(c, a) * s
+    solid_angle = 2 * math.atan2(volume, denominator)
+    return (sides - volume * solid_angle) / double_area
 
 
 @compiled()
-def _dot(p: tuple[float, float, float], q: tuple[float, float, float]) -> float:
+def _side(a: Vector, b: Vector, normal: Vector) -> float:
+    """Return the term of the side from a to b of a face, times the length of its normal.
+
+    For a side of length l, p is the distance of the point's projection from the line of the side, positive inside, and
+    r, r' are the distances of the point from its ends. On a side, p and the denominator both vanish: the term is 0.
+    """
+    side = _to(b, a)
+    length = _length(side)
+    outward = _cross(side, normal)
+    distance = _dot(outward, a) / length
+    total = _length(a) + _length(b)
+    ratio = (total + length) / max(total - length, _TINY)
+    return distance * math.log(ratio)
+
+
+@compiled()
+def _to(place: Any, start: Vector) -> Vector:
+    return place[0] - start[0], place[1] - start[1], place[2] - start[2]
+
+
+@compiled()
+def _length(vector: Vector) -> float:
+    return math.sqrt(_dot(vector, vector))
+
+
+@compiled()
+def _dot(p: Vector, q: Vector) -> float:
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
 @compiled()
-def _logarithm(total: float, length: float) -> float:
-    """Return ln((r + r' + l)/(r + r' − l)) for a side of length l, from the sum r + r' of the distances to its ends."""
-    return math.log((total + length) / max(total - length, _TINY))
+def _cross(p: Vector, q: Vector) -> Vector:
+    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]

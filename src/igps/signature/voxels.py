@@ -143,9 +143,10 @@ def _scan(
     half_edge, row = _ranges(first, last)
     a = vertices[low[half_edge]]
     b = vertices[high[half_edge]]
-    t = (z_axis[row] - a[:, 2]) / (b[:, 2] - a[:, 2])
-    x = a[:, 0] + t * (b[:, 0] - a[:, 0])
-    y = a[:, 1] + t * (b[:, 1] - a[:, 1])
+    edge = b - a
+    t = (z_axis[row] - a[:, 2]) / edge[:, 2]
+    x = a[:, 0] + t * edge[:, 0]
+    y = a[:, 1] + t * edge[:, 1]
     # A plane that crosses a face crosses exactly two of its edges, one upward and one downward:
     # pair them.
     order = np.lexsort((upward[half_edge], row, half_edge // 3))
@@ -176,7 +177,8 @@ def _scan(
     counts = np.bincount(flat, weights=sign, minlength=int(np.prod(size)))
     crossings = counts.reshape(size).astype(np.int32)
     # The points with smaller x than a crossing have indices below its position.
-    after = np.cumsum(crossings[::-1], axis=0)[::-1][1:]
+    from_end = np.cumsum(crossings[::-1], axis=0)
+    after = from_end[::-1][1:]
     before = -np.cumsum(crossings, axis=0)[:-1]
 
     on_surface = np.zeros(size, dtype=bool)

@@ -1,4 +1,4 @@
-"""Compiled loops of `_multifrontal`: elimination of fronts, and the forward and backward pass of a solve."""
+"""Compiled loops of `multifrontal`: elimination of fronts, and the forward and backward pass of a solve."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from igps._arrays import Floats
 from igps._compiled import compiled
 from igps.spectra._pivots import STEP, Scratch, invert_front
 from igps.spectra._products import COLUMNS, ONE, ROWS, ZERO, product
-from igps.spectra._tree import BLOCK, BOUNDARY, CARRIED, LEFT, OWN, UPDATE, Nodes, Structure
+from igps.spectra.tree import BLOCK, BOUNDARY, CARRIED, LEFT, OWN, UPDATE, Nodes, Structure
 
 
 @compiled(inline="always")

@@ -12,8 +12,8 @@ from scipy.linalg import qr
 from igps._threads import SERIAL, Team
 from igps.spectra._basis import Basis, split
 from igps.spectra._checks import ROUNDING
-from igps.spectra._multifrontal import Factors
 from igps.spectra._products import overlaps, subtract
+from igps.spectra.multifrontal import Factors
 
 # Smallest pivot, relative to the longest row, for which a Cholesky factor is accurate.
 MIN_CHOLESKY_PIVOT = 1e-6

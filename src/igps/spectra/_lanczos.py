@@ -14,7 +14,7 @@ from scipy import sparse
 from igps._threads import Team
 from igps.spectra._checks import ROUNDING
 from igps.spectra._krylov import Krylov
-from igps.spectra._multifrontal import Factors, Tree, analyse
+from igps.spectra.multifrontal import Factors, Tree, analyse
 
 logger = logging.getLogger(__name__)
 

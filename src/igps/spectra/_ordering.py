@@ -1,6 +1,6 @@
 """The elimination order of the unknowns of a sparse symmetric matrix: nested dissection (George 1973).
 
-This is the first step of a factorization, see `_multifrontal`. Only the pattern of the matrix is read.
+This is the first step of a factorization, see `multifrontal`. Only the pattern of the matrix is read.
 """
 
 from typing import NamedTuple

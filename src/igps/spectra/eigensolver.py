@@ -6,7 +6,7 @@ The algorithm is block Lanczos with a shift inside the wanted part of the spectr
 1. With y = M^½ φ the problem is A y = λ y, A = M^-½ L M^-½, and orthogonality is Euclidean. Lengths are measured in
    units of √area, so that nothing depends on the scale of the coordinates.
 2. Weyl's law N(λ) ≈ λ · area / 4π gives a shift σ with about SHIFT_RANK of the wanted eigenvalues below it.
-   (A − σI)⁻¹ is applied by `_multifrontal`. It maps λ to θ = 1/(λ − σ): the wanted eigenvalues are at both ends of the
+   (A − σI)⁻¹ is applied by `multifrontal`. It maps λ to θ = 1/(λ − σ): the wanted eigenvalues are at both ends of the
    spectrum, and every eigenvalue below σ is wanted. The basis is a third smaller than with a shift below
    the spectrum. Several bands with a shift each (manifold harmonics, Vallet & Lévy 2008) would reduce it further, but
    each costs a factorization, and the vectors of neighbouring bands would have to be orthogonalised.
@@ -34,7 +34,7 @@ from scipy.sparse.linalg import ArpackError, eigsh
 from igps._threads import one_thread
 from igps.spectra._checks import ROUNDING, checked_mass, checked_stiffness
 from igps.spectra._lanczos import ConvergenceError, gap_after, lanczos
-from igps.spectra._multifrontal import SingularMatrixError, analyse
+from igps.spectra.multifrontal import SingularMatrixError, analyse
 
 logger = logging.getLogger(__name__)
 

@@ -2,7 +2,7 @@
 
 from scipy.sparse.csgraph import dijkstra
 
-from igps.descriptors.literature._geodesics import edge_graph, farthest_points
+from igps.descriptors.literature.geodesics import edge_graph, farthest_points
 
 __all__ = ["farthest_points", "geodesic_distances"]
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from igps._arrays import Floats, Integers, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors.literature._geodesics import geodesic_samples
+from igps.descriptors.literature.geodesics import geodesic_samples
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 

@@ -5,7 +5,7 @@ import numpy as np
 from igps._arrays import Floats, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors.literature._geodesics import geodesic_samples
+from igps.descriptors.literature.geodesics import geodesic_samples
 from igps.nn.descriptor import BodyDescriptor
 
 

@@ -5,8 +5,8 @@ import numpy as np
 from igps._arrays import Floats, Integers, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors.literature._geodesics import farthest_points
 from igps.descriptors.literature._linear_histogram import linear_histogram
+from igps.descriptors.literature.geodesics import farthest_points
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors, longest_side, unit, vertex_areas

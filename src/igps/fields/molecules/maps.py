@@ -13,10 +13,10 @@ from igps._text import counted
 from igps.data.grids import Grid
 from igps.fields.molecules.molecular_surface import simplified_and_joined
 from igps.fields.volumes import images
-from igps.mesh._isosurface import level_surface
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles
 from igps.mesh.errors import MeshError, NoBodyError
 from igps.mesh.formats import Format, stat_key
+from igps.mesh.isosurface import level_surface
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.mesh.raw_body import RawBody, deferred

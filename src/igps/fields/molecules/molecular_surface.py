@@ -27,9 +27,9 @@ from igps.fields.molecules._molecular_loops import (
     means_at_vertices,
 )
 from igps.fields.molecules.molecule import Molecule
-from igps.mesh._isosurface import level_surface, simplify_surface
 from igps.mesh._level_set import MIN_ABS_VALUE, SPECK_VOLUME, fill_bubbles
 from igps.mesh.errors import MeshError
+from igps.mesh.isosurface import level_surface, simplify_surface
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import connected, face_areas, signed_volume, stacked, vertex_normals
 

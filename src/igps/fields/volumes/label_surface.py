@@ -17,9 +17,9 @@ from igps._arrays import Booleans, Floats, Integers, Singles, Surface
 from igps._text import counted
 from igps.fields.volumes._label_field import PAD, filled_volume, smooth_field
 from igps.fields.volumes._label_gaps import TOUCHING, fill_missed_slices
-from igps.mesh._isosurface import level_surface, restore_volume, simplify_surface
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles, join_pieces
 from igps.mesh.errors import MeshError, NoBodyError
+from igps.mesh.isosurface import level_surface, restore_volume, simplify_surface
 from igps.mesh.limits import check_grid
 from igps.mesh.surface import connected, signed_volume, stacked
 

@@ -27,6 +27,7 @@ from igps.nn._kernels.pair_loops import (
     new_sums,
 )
 from igps.nn._kernels.pairs_by_torch import (
+    Inputs,
     PairValues,
     centres_of,
     cosine_factors,
@@ -238,18 +239,15 @@ class _Shape:
         is_one_axis = self.shapes.n_values == 1 and self.shapes.n_oriented == 0
         if not is_one_block or not is_one_axis or self.centred[0] is None:
             return None
-        products = self._view(self._buffer(1), 0, 0)
-        self._write_values(products, 0, 0)
-        self.products = products
-        return products
+        rows, columns = self._slices(0, 0)
+        self.products = self._values(rows, columns)
+        return self.products
 
     def counts(self, blocks: Blocks) -> list[Tensor]:
         """Return the float64 counts (C(C+1)/2, cells·2^K) of blocks, for all corners of each cell."""
         total = torch.zeros(self.shapes.n_counts, dtype=torch.float64, device="cpu")
-        buffer = self._buffer(self.shapes.n_values)
         for row, column in blocks:
-            values = self._view(buffer, row, column)
-            self._write_values(values, row, column)
+            values = self._values(*self._slices(row, column))
             n_columns = values.shape[2]
             sums = new_sums(self.members, column, n_columns, self.shapes.sums_shape)
             result = new_row(self.axes, n_columns)
@@ -262,14 +260,12 @@ class _Shape:
         by_weights = torch.zeros(self.members[1].shape, dtype=torch.float64, device="cpu")
         by_centres = torch.zeros(self.axes.centres.shape, dtype=torch.float64, device="cpu")
         by_inputs = [[torch.zeros_like(x) for x in pair.inputs] for pair in self.pairs]
-        value_buffer = self._buffer(self.shapes.n_values)
-        cosine_buffer = self._buffer(4 * self.shapes.n_oriented)
         for row, column in blocks:
-            values = self._view(value_buffer, row, column)
-            by_cosines = self._view(cosine_buffer, row, column)
-            self._write_values(values, row, column)
+            rows, columns = self._slices(row, column)
+            values = self._values(rows, columns)
+            by_cosines = values.new_empty(self.shapes.n_oriented, 4, *values.shape[1:])
             derivatives = Derivatives(
-                by_cosines.view(-1, 4, *by_cosines.shape[1:]).numpy(),
+                by_cosines.numpy(),
                 by_weights.numpy(),
                 by_centres.numpy(),
                 np.empty(len(by_centres)),
@@ -283,66 +279,75 @@ class _Shape:
                 derivatives,
                 new_row(self.axes, values.shape[2]),
             )
-            rows = slice(row, row + values.shape[1])
-            columns = slice(column, column + values.shape[2])
-            next_value = iter(values)
-            next_cosine = iter(by_cosines)
+            # Of the values of each pair, in the order of the pairs
+            n_values = 0
+            n_oriented = 0
             for pair, centred, totals in zip(self.pairs, self.centred, by_inputs, strict=True):
-                if centred is not None:
-                    _add_by_points(
-                        next(next_value), centred, rows, columns, totals[0][:, : centred.shape[1]]
-                    )
+                if COSINES in pair.kinds:
+                    upstream = by_cosines[n_oriented]
+                    sides = (rows, columns)
+                    _add_by_inputs(_cosine_products, upstream[:3], pair.inputs, sides, totals)
+                    _add_by_points(upstream[3], pair.inputs[0], rows, columns, totals[0])
+                    n_oriented += 1
                     continue
-                n = len(pair.inputs)
-                leaves = [x[part].requires_grad_() for part in (rows, columns) for x in pair.inputs]
-                with torch.enable_grad():
-                    if COSINES in pair.kinds:
-                        factors = zip(
-                            cosine_factors(*leaves[:n]), cosine_factors(*leaves[n:]), strict=True
-                        )
-                        outputs = torch.stack([left @ right.T for (left, _), (_, right) in factors])
-                        upstream = torch.stack([next(next_cosine) for _ in outputs])
-                        _add_by_points(next(next_cosine), pair.inputs[0], rows, columns, totals[0])
-                    else:
-                        [outputs] = pair.between(
-                            [x[None] for x in leaves[:n]], [x[None] for x in leaves[n:]]
-                        )
-                        upstream = torch.stack([next(next_value) for _ in outputs])
-                for k, gradient in enumerate(torch.autograd.grad(outputs, leaves, upstream)):
-                    totals[k % n][rows if k < n else columns] += gradient
+                upstream = values[n_values : n_values + len(pair.kinds)]
+                n_values += len(pair.kinds)
+                if centred is None:
+                    _add_by_inputs(pair.between, upstream, pair.inputs, (rows, columns), totals)
+                else:
+                    total = totals[0][:, : centred.shape[1]]
+                    _add_by_points(upstream[0], centred, rows, columns, total)
         return [by_weights, by_centres, *(gradient for totals in by_inputs for gradient in totals)]
 
-    def _buffer(self, n_matrices: int) -> Tensor:
-        return torch.empty(
-            n_matrices * math.prod(self.block), dtype=self.shapes.dtype, device="cpu"
-        )
+    def _slices(self, row: int, column: int) -> tuple[slice, slice]:
+        """Return the rows and columns of the block that starts at a row and column."""
+        n_rows, n_columns = self.block
+        rows = slice(row, min(row + n_rows, self.n_points))
+        return rows, slice(column, min(column + n_columns, self.n_points))
 
-    def _view(self, buffer: Tensor, row: int, column: int) -> Tensor:
-        """Return a view (R, I, J) of a buffer for the block that starts at a row and column."""
-        n_matrices = len(buffer) // math.prod(self.block)
-        n = [
-            min(size, self.n_points - first)
-            for size, first in zip(self.block, (row, column), strict=True)
-        ]
-        return buffer[: n_matrices * math.prod(n)].view(n_matrices, *n)
-
-    def _write_values(self, values: Tensor, row: int, column: int) -> None:
-        """Write the values of a block, or the inner products for distances, as `count_block` takes them."""
+    def _values(self, rows: slice, columns: slice) -> Tensor:
+        """Return the values (R, I, J) of a block, or the inner products for distances, as `count_block` takes them."""
         if self.products is not None:
-            values.copy_(self.products)
-            return
-        rows = slice(row, row + values.shape[1])
-        columns = slice(column, column + values.shape[2])
-        matrices = iter(values)
+            return self.products.clone()
+        shape = rows.stop - rows.start, columns.stop - columns.start
+        values = torch.empty(self.shapes.n_values, *shape, dtype=self.shapes.dtype, device="cpu")
+        n_written = 0
         for pair, centred in zip(self.pairs, self.centred, strict=True):
             if centred is not None:
-                _write_products(centred, rows, columns, next(matrices))
+                _write_products(centred, rows, columns, values[n_written])
             elif VALUES in pair.kinds:
-                between = pair.between(
-                    [x[None, rows] for x in pair.inputs], [x[None, columns] for x in pair.inputs]
-                )
-                for value in between[0]:
-                    next(matrices).copy_(value)
+                between = pair.between(*_at(pair.inputs, rows, columns))
+                values[n_written : n_written + len(pair.kinds)] = between[0]
+            n_written += sum(kind != COSINES for kind in pair.kinds)
+        return values
+
+
+def _at(inputs: Sequence[Tensor], rows: slice, columns: slice) -> tuple[list[Tensor], list[Tensor]]:
+    """Return the inputs (1, I, ...) of the points of rows, and (1, J, ...) of those of columns."""
+    return [x[None, rows] for x in inputs], [x[None, columns] for x in inputs]
+
+
+def _add_by_inputs(
+    between: Callable[[Inputs, Inputs], Tensor],
+    upstream: Tensor,
+    inputs: Sequence[Tensor],
+    sides: tuple[slice, slice],
+    totals: Sequence[Tensor],
+) -> None:
+    """Add derivatives by inputs to totals, from those by values (k, I, J), of which `between` returns (1, k, I, J)."""
+    leaves = [[x.requires_grad_() for x in side] for side in _at(inputs, *sides)]
+    with torch.enable_grad():
+        values = between(*leaves)
+    gradients = iter(torch.autograd.grad(values, [*leaves[0], *leaves[1]], upstream[None]))
+    for side in sides:
+        for total in totals:
+            total[side] += next(gradients)[0]
+
+
+def _cosine_products(rows: Inputs, columns: Inputs) -> Tensor:
+    """Return the products (1, 3, I, J) of the `cosine_factors`, of which the cosines are made."""
+    factors = zip(cosine_factors(*rows), cosine_factors(*columns), strict=True)
+    return torch.stack([left @ right.mT for (left, _), (_, right) in factors], dim=1)
 
 
 def _inverse_gaps(centres: Numbers, bins: Sequence[int]) -> tuple[Numbers, Booleans]:

@@ -42,7 +42,7 @@ from igps.spectra import _fronts as loops
 from igps.spectra._checks import checked_entries
 from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
 from igps.spectra._pivots import Scratch
-from igps.spectra._tree import BLOCK, CARRIED, UPDATE, Nodes, Structure, tree_structure
+from igps.spectra.tree import BLOCK, CARRIED, UPDATE, Nodes, Structure, tree_structure
 
 # Largest number of own unknowns of a node that compiled loops handle. PyTorch handles larger nodes, with a team.
 MAX_COMPILED = 127

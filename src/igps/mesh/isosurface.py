@@ -8,8 +8,8 @@ from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles
 from igps.mesh.errors import MeshError
 from igps.mesh.surface import (
     directed_edges,
+    dots,
     face_areas,
-    longest_side,
     signed_volume,
     vertex_normals,
 )
@@ -37,7 +37,8 @@ def level_surface(field: Singles, name: str) -> Surface:
         # Fill the four or eight grid points around each vertex at which the surface meets itself.
         for vertex in np.unique(bad_edges):
             low = np.maximum(np.floor(vertices[vertex]).astype(int), 1)
-            end = np.minimum(np.ceil(vertices[vertex]).astype(int) + 1, np.array(field.shape) - 1)
+            high = np.ceil(vertices[vertex]).astype(int) + 1
+            end = np.minimum(high, np.array(field.shape) - 1)
             box = tuple(map(slice, low, end))
             field[box] = np.minimum(field[box], -MIN_ABS_VALUE)
         field = fill_bubbles(field)
@@ -50,11 +51,7 @@ def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Su
     """Simplify a closed surface to about `max_vertices` vertices of the same volume and topology."""
     if len(vertices) <= max_vertices:
         return vertices, faces
-    centre = vertices.mean(axis=0)
-    scale = longest_side(vertices)
-    triangles = np.ascontiguousarray(faces, dtype=np.int64)
-    points, triangles = collapse_edges((vertices - centre) / scale, triangles, max_vertices)
-    points = points * scale + centre
+    points, triangles = collapse_edges(vertices, faces, max_vertices)
     triangles = _flip_edges(points, triangles)
     return restore_volume(points, triangles, signed_volume(vertices, faces)), triangles
 
@@ -75,7 +72,8 @@ def _non_manifold_edges(faces: Integers, n_vertices: int) -> Integers:
     start, end = directed_edges(faces)
     forward = np.sort(start * n_vertices + end)
     backward = np.sort(end * n_vertices + start)
-    if (forward[1:] > forward[:-1]).all() and np.array_equal(forward, backward):
+    are_distinct = (forward[1:] > forward[:-1]).all()
+    if are_distinct and np.array_equal(forward, backward):
         return np.zeros((0, 2), dtype=np.int64)
     forward, n_forward = np.unique(forward, return_counts=True)
     keys = np.concatenate([forward[n_forward > 1], np.setxor1d(forward, backward)])
@@ -91,7 +89,8 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
     for _ in range(_MAX_FLIPS):
         side, other, corners = _quadrilaterals(faces, len(vertices))
         ends = vertices[corners]
-        gain = _angle(ends[2], ends[0], ends[1]) + _angle(ends[3], ends[1], ends[0]) - np.pi
+        a, b, c, d = ends
+        gain = _angle(c, a, b) + _angle(d, b, a) - np.pi
         flips = np.flatnonzero(gain > _MIN_GAIN)
         c, d = corners[2:, flips]
         can_flip = _are_flat(*ends[:, flips]) & (c != d)
@@ -136,7 +135,7 @@ def _are_flat(a: Floats, b: Floats, c: Floats, d: Floats) -> Booleans:
     is_flat = np.ones(len(a), dtype=bool)
     for vectors in (*old, *new):
         size = np.linalg.norm(vectors, axis=1)
-        is_parallel = np.einsum("ij,ij->i", vectors, mean) > _MIN_COSINE * size
+        is_parallel = dots(vectors, mean) > _MIN_COSINE * size
         # The normal of a triangle without area does not matter.
         has_no_area = size < 1e-3 * length[:, 0]
         is_flat &= is_parallel | has_no_area
@@ -153,10 +152,12 @@ def _are_edges(a: Integers, b: Integers, faces: Integers, n_vertices: int) -> Bo
 
 def _independent(left: Integers, right: Integers, gain: Floats, new_edges: Integers) -> Integers:
     """Choose flips: each face takes part only in its best one, and no two create the same edge."""
-    best = np.full(max(left.max(initial=0), right.max(initial=0)) + 1, -np.inf)
+    last = max(left.max(initial=0), right.max(initial=0))
+    best = np.full(last + 1, -np.inf)
     for face in (left, right):
         np.maximum.at(best, face, gain)
-    chosen = np.nonzero((gain >= best[left]) & (gain >= best[right]))[0]
+    is_best = (gain >= best[left]) & (gain >= best[right])
+    chosen = np.flatnonzero(is_best)
     _, first = np.unique(new_edges[chosen], return_index=True)
     chosen = chosen[first]
     in_flips = np.concatenate([left[chosen], right[chosen]])
@@ -169,4 +170,5 @@ def _independent(left: Integers, right: Integers, gain: Floats, new_edges: Integ
 def _angle(apex: Floats, a: Floats, b: Floats) -> Floats:
     u = a - apex
     v = b - apex
-    return np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v))
+    sine = np.linalg.norm(np.cross(u, v), axis=1)
+    return np.arctan2(sine, dots(u, v))
