@@ -64,10 +64,9 @@ def _tile(n_columns: int) -> Any:
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             operands = []
             for numba_type, value in zip(signature.args, values, strict=True):
-                items = [value]
-                if isinstance(numba_type, types.BaseTuple):
-                    items = cgutils.unpack_tuple(builder, value)
-                if isinstance(numba_type, types.BaseTuple) and numba_type is not size:
+                is_tuple = isinstance(numba_type, types.BaseTuple)
+                items = cgutils.unpack_tuple(builder, value) if is_tuple else [value]
+                if is_tuple and numba_type is not size:
                     array = context.make_array(numba_type[0])(context, builder, items[0])
                     items[0] = builder.gep(array.data, [items[1]])
                 operands.append(items)
