@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
 from igps._arrays import Floats, Integers
-from igps.descriptors.literature._geodesics import edge_graph
+from igps.descriptors.literature.geodesics import edge_graph
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import simplify
