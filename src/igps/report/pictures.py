@@ -25,7 +25,6 @@ from igps.mesh._collapse_loops import collapse_edges
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Frame, Mesh
-from igps.mesh.surface import longest_side
 from igps.report.drawing import axes_of
 from igps.report.views import patient_views
 from igps.signature.signature import Signature
