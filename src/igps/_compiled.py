@@ -69,7 +69,7 @@ class Compiled(Lazy, Generic[Arguments, Result]):
         with _alone(dispatcher):
             try:
                 return dispatcher(*args, **kwargs)
-            except AttributeError:  # a file in the cache refers to a class of an earlier version
+            except (AttributeError, ImportError):  # the cache names a class of an earlier version
                 dispatcher._cache.flush()
                 return dispatcher(*args, **kwargs)
 

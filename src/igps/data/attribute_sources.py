@@ -9,6 +9,7 @@ replaced values is logged. If more than a tenth of the values are missing, the b
 
 import contextlib
 import logging
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -94,10 +95,15 @@ class FileAttribute(ABC):
         """Return the file of a body and the name of its array, or ""; raise a MeshError if there is no such file."""
         pattern, _, name = self.path.partition("#")
         root = body.path.parent if self.root is None else self.root
-        below_root = body.path.name
-        own_file = body.path.parent.resolve() / body.path.name  # which may be a link to any place
-        if own_file.is_relative_to(root.resolve()):
-            below_root = own_file.relative_to(root.resolve()).as_posix()
+        # Links in the path of the folder are resolved only if needed. The file itself may be a link to any place
+        locations = (
+            (Path(os.path.abspath(body.path)), Path(os.path.abspath(root))),
+            (body.path.parent.resolve() / body.path.name, root.resolve()),
+        )
+        relative = (
+            file.relative_to(folder) for file, folder in locations if file.is_relative_to(folder)
+        )
+        below_root = next(relative, Path(body.path.name)).as_posix()
         if Path(pattern).is_absolute():
             root = (
                 Path(pattern.partition("{")[0]).parent if "{" in pattern else Path(pattern).parent
