@@ -58,17 +58,22 @@ def started(folder, code):
     )
 
 
-def test_loops_of_an_earlier_version_are_compiled_anew(tmp_path):
+@pytest.mark.parametrize("modules", [("kinds", "kinds"), ("kinds_before", "kinds")])
+def test_loops_of_an_earlier_version_are_compiled_anew(modules, tmp_path):
     """Numba's index of what lies on disk names the types of arguments, and is read before it is found to be stale."""
-    for name, factor in (("Old", 2), ("New", 3)):
+    for module, name, factor in zip(modules, ("Old", "Newer"), (2, 3), strict=True):
+        kinds = tmp_path / f"{module}.py"
+        kinds.write_text(
+            f"from typing import NamedTuple\nclass {name}(NamedTuple):\n    x: float\n"
+        )
         (tmp_path / "loops.py").write_text(
-            "from typing import NamedTuple\nfrom igps._compiled import compiled\n"
-            f"class {name}(NamedTuple):\n    x: float\n"
+            f"from igps._compiled import compiled\nfrom {module} import {name}\n"
             f"@compiled()\ndef times(pair):\n    return {factor} * pair.x\n"
         )
         process = started(tmp_path, f"import loops; print(loops.times(loops.{name}(5.0)))")
         found, _ = process.communicate()
         assert float(found) == 5 * factor
+        kinds.unlink()
 
 
 def test_of_several_processes_one_compiles(tmp_path):
