@@ -193,6 +193,7 @@ class KernelHead(Head):
     Args:
         prior: a fitted head, which is not changed; None for no prior. With one training shape per class, which does not
             show how the shapes of a class vary, only the kernel of the prior is used.
+        n_directions, shrinkage: of the `WhitenedHead`.
         ridge: added to the kernel's diagonal, which is 1.
         prior_share: weight of the prior's kernel, between 0 and 1.
         temperature: of the softmax; with n < 6 training shapes per class on average, it is multiplied by 6 / n.
@@ -208,6 +209,8 @@ class KernelHead(Head):
     def __init__(
         self,
         prior: Head | None = None,
+        n_directions: int = 64,
+        shrinkage: float = 0.3,
         ridge: float = 0.03,
         prior_share: float = 1 / 3,
         temperature: float = 0.05,
@@ -215,7 +218,7 @@ class KernelHead(Head):
         super().__init__()
         check_positive(ridge=ridge, temperature=temperature)
         check_fraction(prior_share=prior_share)
-        self.whitened = WhitenedHead()
+        self.whitened = WhitenedHead(n_directions, shrinkage)
         self.prior = prior
         self.ridge = ridge
         self.prior_share = prior_share
