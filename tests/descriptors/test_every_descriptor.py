@@ -211,6 +211,15 @@ def modules_of(name):
     return {type(one) for one in descriptor(name).modules()}
 
 
+@pytest.mark.parametrize("name", [*NAMES, "interior+size"])
+def test_a_descriptor_that_is_made_on_the_device_meta_has_no_values(name):
+    with torch.device("meta"):
+        found = igps.descriptor(name)
+    shapes = {key: value.shape for key, value in igps.descriptor(name).state_dict().items()}
+    assert {key: value.shape for key, value in found.state_dict().items()} == shapes
+    assert all(value.is_meta for value in found.state_dict().values())
+
+
 def fewer_samples(batch, n):
     return replace(
         batch, interior=batch.interior.subset(n, seed=0), surface=batch.surface.subset(n, seed=0)

@@ -7,6 +7,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, get_args
 
+import torch
+
 from igps._parameters import check_one_of
 from igps.descriptors.from_file import is_descriptor_file, load
 from igps.descriptors.measures import Measures
@@ -95,10 +97,15 @@ def descriptor(
     if isinstance(which, str):
         suffixes = _SIZE_OR_SIDE.findall(which)
         which = _SIZE_OR_SIDE.sub("", which)
-    base = _base_descriptor(which)
     parts = layout_parts(learnable)
-    if parts or n_training_samples is not None:
-        base = with_layout(base, parts, n_training_samples)
+    device = torch.get_default_device()
+    is_meta = device.type == "meta"  # without values, which are checked here
+    with torch.device("cpu" if is_meta else device):
+        base = _base_descriptor(which)
+        if parts or n_training_samples is not None:
+            base = with_layout(base, parts, n_training_samples)
+    if is_meta and base is not which:
+        base = base.to(device)
     compares_size = size == "keep" if units is None else keeps_size(size, units)[0]
     with_size = compares_size or SIZE in suffixes
     with_side = mirror == "distinct" or SIDE in suffixes

@@ -2,13 +2,16 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+import igps
 from igps.descriptors.literature.d2 import D2
-from igps.nn.descriptor import EmbeddedDescriptor
+from igps.nn.axes import InteriorDistance, Potential
+from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 from igps.nn.heads.two_level import TwoLevelHead
 from igps.nn.heads.wccn import WCCNHead
+from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
 
 
@@ -157,3 +160,15 @@ def test_state_round_trips_into_one_without_sizes(histograms):
 def test_share_out_of_range_is_refused(share):
     with pytest.raises(ValueError, match="share"):
         BlendedDistance(share=share)
+
+
+def test_a_trained_head_is_kept_in_the_file_of_a_descriptor(histograms, tmp_path):
+    head = ProjectionHead(width=4, n_hidden=6).fit(histograms, torch.zeros(12))
+    counted = PairHistogram([Potential(2), InteriorDistance(8)])  # 3 pairs of classes
+    model = EmbeddedDescriptor(HistogramDescriptor(counted), head, name="mine")
+    with pytest.raises(ValueError, match=r"a head that was never called\. Train it"):
+        model.save(tmp_path / "mine.safetensors")
+    expected = head.eval()(histograms)
+    model.save(tmp_path / "mine.safetensors")
+    loaded = igps.load(tmp_path / "mine.safetensors")
+    assert_close(loaded.head(histograms), expected, rtol=0, atol=0)
