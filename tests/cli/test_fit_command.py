@@ -152,6 +152,9 @@ def test_what_is_unlike_everything_is_said(root, model, tmp_path, capsys):
     assert "unlike every known class" in rod
     assert "%" not in rod
     assert next(line for line in lines if "1.off" in line).endswith("flat")
+    assert lines[-1].startswith(
+        "The model was fitted to 6 bodies. So few do not tell how sure it is"
+    )
 
 
 def test_wrong_files_cost_one_sentence(root, model, tmp_path, capsys):

@@ -27,7 +27,7 @@ BALL = compute_signature(
     SignatureConfig(n_eigenpairs=5, resolution=10, min_samples=0, n_surface_samples=20),
 )
 N = len(BALL.interior.points)
-TURNS = np.array([-0.8, -0.4, 0, 0.4, 0.8])
+TURNS = np.array([-0.75, -0.25, 0.25, 0.75])
 SEPARATIONS = np.array([0, 1, 2, 3, 4, 5, 6.5, 9, 12.5, 17.5, 25, 37, 57, 89, 130])
 
 
@@ -37,15 +37,31 @@ def walk(seed: int, n: int = 150) -> Floats:
     return np.cumsum(3.8 * steps / norm(steps, axis=1, keepdims=True), axis=0)
 
 
+def advances_of(residues: Floats, reach: int) -> Floats:
+    """(n, 3) Å for each residue, along a chain without gaps, over so many residues before and after."""
+    rows = []
+    for i in range(len(residues)):
+        around = residues[max(i - reach, 0) : i + reach + 1]
+        rows.append((around[-1] - around[0]) / (len(around) - 1))
+    return np.array(rows)
+
+
 def directions_of(residues: Floats) -> Floats:
     """(n, 3) unit vectors along a chain without gaps, over three residues before and after."""
-    vectors = [residues[i : i + 4][-1] - residues[max(i - 3, 0)] for i in range(len(residues))]
-    return np.array(vectors) / norm(vectors, axis=1, keepdims=True)
+    vectors = advances_of(residues, 3)
+    return vectors / norm(vectors, axis=1, keepdims=True)
+
+
+def rises_of(residues: Floats) -> Floats:
+    """(n,) Å for each residue, from the second before to the second after."""
+    return norm(advances_of(residues, 2), axis=1)
 
 
 def signature(residues: Floats, places: Floats, nearest: NDArray[np.int64]) -> Signature:
     """Samples of a ball, each with a residue."""
-    trace = np.column_stack([residues, directions_of(residues), places])[nearest]
+    trace = np.column_stack([residues, directions_of(residues), rises_of(residues), places])[
+        nearest
+    ]
     return replace(BALL, interior=BALL.interior.with_attributes({"trace": trace}))
 
 
@@ -68,15 +84,18 @@ def test_every_residue_counts_once_in_the_row_of_its_separation() -> None:
     twist = (np.cross(one, other) * line).sum(axis=1) / distance
     separation = hats(np.abs(places[i] - places[j]), SEPARATIONS)[:, 2:]
     axes = (
-        hats(distance, np.arange(2.5, 40, 5)),
+        hats(distance, np.arange(4, 40, 8)),
         hats((one * other).sum(axis=1), TURNS),
         hats(twist, TURNS),
     )
-    wanted = np.einsum("ps,pd,pc,pt->sdct", separation, *axes, optimize=True)
-    n_pairs = wanted.sum(axis=(1, 2, 3))
-    weights = n_pairs / (n_pairs + 2000) / (1 + SEPARATIONS[2:] / 10)
+    earlier, later = hats(rises_of(residues), np.array([1.75, 3.0]))[[i, j]]
+    wanted = np.einsum(
+        "ps,py,pz,pd,pc,pt->syzdct", separation, earlier, later, *axes, optimize=True
+    )
+    n_pairs = wanted.sum(axis=(1, 2, 3, 4, 5))
+    weights = n_pairs / (n_pairs + 2000) / (1 + SEPARATIONS[2:] / 20)
     weights /= weights.sum() * n_pairs
-    expected = wanted * weights[:, None, None, None]
+    expected = wanted * weights[:, None, None, None, None, None]
     assert_allclose(found, expected, atol=2e-6)
 
 
@@ -129,9 +148,9 @@ def test_residues_of_other_kinds_change_nothing() -> None:
     other = traced("TRP", np.eye(3))
     turned = traced("GLY", turn)
     assert_array_equal(one, other)
-    wanted = [one[:, :3] @ turn, one[:, 3:6] @ turn, one[:, 6]]
+    wanted = [one[:, :3] @ turn, one[:, 3:6] @ turn, one[:, 6:]]
     assert_allclose(turned, np.column_stack(wanted), atol=1e-9)
-    nearest = one[:, 6].astype(int)
+    nearest = one[:, 7].astype(int)
     found = one[:, 3:6]
     expected = directions_of(residues)[nearest]
     assert_allclose(found, expected, atol=1e-9)
@@ -168,7 +187,7 @@ def test_directions_do_not_cross_gaps() -> None:
 
 
 def test_it_is_found_by_name_and_asks_for_a_trace() -> None:
-    assert igps.descriptor("fold").n_features == 13 * 8 * 25
+    assert igps.descriptor("fold").n_features == 13 * 4 * 5 * 16
     with pytest.raises(ValueError, match="needs signatures with trace"):
         fold()(collate([BALL]))
-    assert FoldHistogram().shape == (13, 8, 5, 5)
+    assert FoldHistogram().shape == (13, 2, 2, 5, 4, 4)

@@ -170,7 +170,7 @@ def test_each_attribute_is_known_by_its_name():
         values = residue_attribute(molecule, points(), name)
         columns = {
             "residue_shares": (len(RESIDUE_KINDS),),
-            "trace": (7,),
+            "trace": (8,),
             "composition": (26,),
         }
         assert values.shape == (7, *columns.get(name, ()))

@@ -6,7 +6,6 @@ sequences are.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from torch import Tensor
 from igps.data.requirements import Requirements
 from igps.nn._kernels.pairs import count_pairs
 from igps.nn._kernels.pairs_by_torch import PairValues, euclidean_distances, pair_twists
-from igps.nn.axes import OrderedCentres, PairAxis
+from igps.nn.axes import OrderedCentres
 from igps.nn.axes.points import attribute_requirements
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.descriptor import HistogramDescriptor
@@ -28,72 +27,24 @@ TRACE = "trace"
 _SEPARATIONS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 9.0, 12.5, 17.5, 25.0, 37.0, 57.0, 89.0, 130.0)
 _N_NEIGHBOURS = 2
 # The separation at which a class counts half as much as near ones: far residues move as domains move.
-_HALF_SEPARATION = 10.0
+_HALF_SEPARATION = 20.0
 # The number of pairs at which a class counts half as much as one of many pairs: few pairs tell little.
 _FEW_PAIRS = 2000.0
-_DISTANCES = (2.5, 7.5, 12.5, 17.5, 22.5, 27.5, 32.5, 37.5)  # Å
+_DISTANCES = (4.0, 12.0, 20.0, 28.0, 36.0)  # Å
 # Centres of the classes of the angle and of the twist between two directions of the chain.
-_TURNS = (-0.8, -0.4, 0.0, 0.4, 0.8)
+_TURNS = (-0.75, -0.25, 0.25, 0.75)
+# Å of the chain for each residue, of a helix and of a strand; residues between them are shared.
+_RISES = (1.75, 3.0)
 _N_SAMPLES = 2000
-
-
-class _TraceAxis(PairAxis):
-    """Base class of axes of the residues that are nearest to the samples."""
-
-    def __init__(self, centres: Sequence[float]) -> None:
-        super().__init__()
-        self.centres = OrderedCentres(centres)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The number of classes."""
-        return (len(self.centres.start),)
-
-    def requirements(self, embedding: torch.nn.Module) -> Requirements:
-        """Return the requirement of the trace."""
-        return attribute_requirements(TRACE)
-
-
-class ChainSeparation(_TraceAxis):
-    """Classes of the separation of two residues along their chain, in residues."""
-
-    def pairs(self, features: SampleFeatures, embedding: torch.nn.Module) -> PairValues:
-        """Return the differences of the places of the residues."""
-        places = features.attribute(TRACE)[..., 6]
-        return PairValues((places,), (self.centres(),), _separations)
-
-
-class ResidueDistance(_TraceAxis):
-    """Bins of the distance between two residues (Cα in proteins), Å."""
-
-    def pairs(self, features: SampleFeatures, embedding: torch.nn.Module) -> PairValues:
-        """Return the distances of the residues."""
-        return euclidean_distances(features.attribute(TRACE)[..., :3], self.centres())
-
-
-class ChainCosine(_TraceAxis):
-    """Classes of the cosine of the angle between the directions of the chain at two residues."""
-
-    def pairs(self, features: SampleFeatures, embedding: torch.nn.Module) -> PairValues:
-        """Return the inner products of the directions."""
-        return PairValues((features.attribute(TRACE)[..., 3:6],), (self.centres(),), _cosines)
-
-
-class ChainTwist(_TraceAxis):
-    """Classes of the twist of the chain between two residues, see `pair_twists`: mirror images have opposite signs."""
-
-    def pairs(self, features: SampleFeatures, embedding: torch.nn.Module) -> PairValues:
-        """Return the twists of the positions and directions."""
-        trace = features.attribute(TRACE)
-        return pair_twists(trace[..., :3], trace[..., 3:6], self.centres())
 
 
 class FoldHistogram(SampleHistogram):
     """Distances, angles and twists of pairs of residues, a histogram for each class of separation along the chain.
 
-    The weight of a class falls to a half at a separation of 10 residues, as far residues move with domains, and is a
-    half with 2000 pairs, as fewer pairs scatter more. The weights of all classes sum to 1. Every residue that is the
-    nearest of a sample counts once, however many samples are near it.
+    Pairs are told apart by how much the chain rises with each residue, at the earlier and at the later one: helices
+    from strands. The weight of a class of separation falls to a half at 20 residues, as far residues move with domains,
+    and is a half with 2000 pairs, as fewer pairs scatter more. The weights of all classes sum to 1. Every residue that
+    is the nearest of a sample counts once, however many samples are near it.
 
     Args:
         n_samples: see `SampleHistogram`.
@@ -104,17 +55,17 @@ class FoldHistogram(SampleHistogram):
 
     def __init__(self, n_samples: int | None = _N_SAMPLES) -> None:
         super().__init__("interior", n_samples)
-        self.separation = ChainSeparation(_SEPARATIONS)
-        self.others = torch.nn.ModuleList(
-            [ResidueDistance(_DISTANCES), ChainCosine(_TURNS), ChainTwist(_TURNS)]
-        )
-        self.embedding = SpectralEmbedding(n_eigenpairs=1)  # the axes use none
+        self.separations = OrderedCentres(_SEPARATIONS)
+        self.rises = OrderedCentres(_RISES)
+        self.distances = OrderedCentres(_DISTANCES)
+        self.turns = OrderedCentres(_TURNS)
+        self.embedding = SpectralEmbedding(n_eigenpairs=1)  # none is used
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The number of classes of separation, of distance, of the cosine and of the twist."""
-        bins = [n for axis in self.others for n in cast(_TraceAxis, axis).shape]
-        return (self.separation.shape[0] - _N_NEIGHBOURS, *bins)
+        """The number of classes of separation, of both rises, of distance, of the cosine and of the twist."""
+        bins = [len(c) for c in (_RISES, _RISES, _DISTANCES, _TURNS, _TURNS)]
+        return (len(_SEPARATIONS) - _N_NEIGHBOURS, *bins)
 
     @property
     def requirements(self) -> Requirements:
@@ -122,22 +73,31 @@ class FoldHistogram(SampleHistogram):
         return replace(attribute_requirements(TRACE), eigenpairs=False)
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
-        """Return histograms (N, S, B, 5, 5) of the samples of N shapes; classes without a pair are 0."""
-        mask = features.samples.mask
-        axes = [self.separation, *self.others]
-        pairs = [axis.pairs(features, self.embedding) for axis in axes]
-        weights = _residue_weights(features.attribute(TRACE)[..., 6], mask)
-        weights = weights * features.weights_or_ones(weights)
+        """Return histograms (N, S, 2, 2, B, 4, 4) of the samples of N shapes; classes without a pair are 0."""
+        trace = features.attribute(TRACE)
+        positions = trace[..., :3]
+        directions = trace[..., 3:6]
+        places = trace[..., 7]
+        pairs = [
+            PairValues((places,), (self.separations(),), _separations),
+            PairValues((trace[..., 6:],), (self.rises(), self.rises()), _rises),
+            euclidean_distances(positions, self.distances()),
+            PairValues((directions,), (self.turns(),), _cosines),
+            pair_twists(positions, directions, self.turns()),
+        ]
+        samples = features.weights_or_ones(places)
+        weights, mask = _residues(places, samples, features.samples.mask)
         classes = torch.zeros(*mask.shape, 1, dtype=torch.long, device=mask.device)
         counts = count_pairs(classes, weights.unsqueeze(2), 1, pairs, mask)
         rows = counts[:, 0, _N_NEIGHBOURS:].flatten(2)
+        n_residues = mask.sum(dim=1).view(-1, 1, 1)
+        rows = rows.masked_fill(n_residues < 2, 0.0)  # without a pair
         # The sums depend on the weights of the samples, but on no other input that may have gradients.
         sums = rows.sum(dim=2, keepdim=True).detach()
         tiny = torch.finfo(sums.dtype).tiny
-        n_points = mask.sum(dim=1).view(-1, 1, 1)
-        n_pairs = sums * (n_points * (n_points - 1) / 2)
-        separations = self.separation.centres()[_N_NEIGHBOURS:, None]
-        shares = n_pairs / (n_pairs + _FEW_PAIRS) / (1 + separations / _HALF_SEPARATION)
+        n_pairs = sums * (n_residues * (n_residues - 1) / 2)
+        far = 1 + self.separations()[_N_NEIGHBOURS:, None] / _HALF_SEPARATION
+        shares = n_pairs / (n_pairs + _FEW_PAIRS) / far
         shares = shares / shares.sum(dim=1, keepdim=True).clamp_min(tiny)
         cells = rows / sums.clamp_min(tiny) * shares
         return cells.unflatten(2, counts.shape[3:])
@@ -148,15 +108,37 @@ def _separations(rows: Sequence[Tensor], columns: Sequence[Tensor]) -> Tensor:
     return (rows[0].unsqueeze(2) - columns[0].unsqueeze(1)).abs().unsqueeze(1)
 
 
+def _rises(rows: Sequence[Tensor], columns: Sequence[Tensor]) -> Tensor:
+    """Return the rises (N, 2, I, J) at the earlier and the later residue, of rises and places (N, I, 2), (N, J, 2)."""
+    one = rows[0].unsqueeze(2)
+    other = columns[0].unsqueeze(1)
+    is_earlier = one[..., 1] < other[..., 1]
+    earlier = torch.where(is_earlier, one[..., 0], other[..., 0])
+    later = torch.where(is_earlier, other[..., 0], one[..., 0])
+    return torch.stack([earlier, later], dim=1)
+
+
 def _cosines(rows: Sequence[Tensor], columns: Sequence[Tensor]) -> Tensor:
     """Return the inner products (N, 1, I, J) of directions (N, I, 3) and (N, J, 3)."""
     return (rows[0] @ columns[0].mT).unsqueeze(1)
 
 
-def _residue_weights(places: Tensor, mask: Tensor) -> Tensor:
-    """Return weights (N, P) of samples, by their places (N, P), that add up to 1 for each residue."""
+def _residues(places: Tensor, weights: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean weight (N, P) of the samples of the same residue, and whether a sample is the first of its own.
+
+    Args:
+        places: (N, P) of the residues of samples; those of two residues differ.
+        weights: (N, P) of the samples.
+        mask: (N, P) true where a sample is real.
+    """
     is_same = (places.unsqueeze(2) == places.unsqueeze(1)) & mask.unsqueeze(1)
-    return 1 / is_same.sum(dim=2).clamp_min(1).to(places.dtype)
+    first = is_same.view(torch.uint8).argmax(dim=2)
+    is_real = mask.to(places.dtype)
+    none = torch.zeros_like(is_real)
+    sums = none.scatter_add(1, first, weights.to(places.dtype) * is_real)
+    n_samples = none.scatter_add(1, first, is_real)
+    order = torch.arange(places.shape[1], device=places.device)
+    return sums / n_samples.clamp_min(1), mask & (first == order)
 
 
 def fold() -> HistogramDescriptor:

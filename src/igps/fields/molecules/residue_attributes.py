@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from igps._arrays import Floats
+from igps._arrays import Floats, Integers
 from igps._parameters import check_one_of
 from igps.data.attribute_sources import fill_missing
 from igps.fields.molecules.bodies import molecule_of
@@ -36,6 +36,7 @@ DEBYE_LENGTH = 7.85
 # Residues between the ends of a direction of the chain and its middle. Neighbours alone would turn with each residue of
 # a helix; so many give the direction of the helix or strand.
 _REACH = 3
+_SHORT_REACH = 2  # of the rise, which tells helices from strands
 
 # Largest number of entries of a matrix of points by residues
 _BLOCK_SIZE = 2**22
@@ -76,28 +77,34 @@ def residue_means(molecule: Molecule, points: Floats, values: Floats) -> Floats:
 
 
 def trace(molecule: Molecule, points: Floats) -> Floats:
-    """Return the nearest residue of a polymer to points (P, 3), as (P, 7): position, direction of the chain, place.
+    """Return the nearest residue of a polymer to points (P, 3): position, direction of the chain, rise, place (P, 8).
 
     Positions, Å, are relative to the mean of the residues, as attributes have single precision. Directions, of length
-    1, point from the third residue before to the third after, or to the last ones without a gap; 0 for one alone.
+    1, point from the third residue before to the third after; 0 for one alone. The rise is the distance from the second
+    residue before to the second after, Å for each residue. Both end where a gap begins.
     """
     is_linked = np.isfinite(molecule.places)
     if not is_linked.any():
-        return np.full((len(points), 7), np.nan)
+        return np.full((len(points), 8), np.nan)
     positions = molecule.residue_positions[is_linked]
     places = molecule.places[is_linked]
     run = np.cumsum(np.diff(places, prepend=places[0]) != 1)
-    first = np.searchsorted(run, run)
-    last = np.searchsorted(run, run, side="right") - 1
-    order = np.arange(len(run))
-    before = np.maximum(order - _REACH, first)
-    after = np.minimum(order + _REACH, last)
-    directions = positions[after] - positions[before]
+    directions = _advances(positions, run, _REACH)
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     directions /= np.maximum(lengths, 1e-9)
-    rows = np.column_stack([positions - positions.mean(axis=0), directions, places])
+    rises = np.linalg.norm(_advances(positions, run, _SHORT_REACH), axis=1)
+    rows = np.column_stack([positions - positions.mean(axis=0), directions, rises, places])
     _, nearest = cKDTree(positions).query(points)
     return rows[nearest]
+
+
+def _advances(positions: Floats, run: Integers, reach: int) -> Floats:
+    """Return how far the chain advances with each residue (R, 3), from so many before to so many after in its run."""
+    order = np.arange(len(run))
+    before = np.maximum(order - reach, np.searchsorted(run, run))
+    after = np.minimum(order + reach, np.searchsorted(run, run, side="right") - 1)
+    n_steps = np.maximum(after - before, 1)
+    return (positions[after] - positions[before]) / n_steps[:, None]
 
 
 def composition(molecule: Molecule, points: Floats) -> Floats:
@@ -110,7 +117,7 @@ def composition(molecule: Molecule, points: Floats) -> Floats:
 def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
     """Return a named attribute of points (P, 3), Å: (P,), or (P, C) of several numbers; a ValueError for others.
 
-    "residue_shares" has 25 numbers, "composition" 26, "trace" 7.
+    "residue_shares" has 25 numbers, "composition" 26, "trace" 8.
     """
     if name in _AT_POINTS:
         return _AT_POINTS[name](molecule, points)
@@ -186,7 +193,7 @@ class ResidueAttribute:
 
     def cache_tag(self, body: BodyRef) -> str:
         """Return the name. The molecule is the body's own file, which is part of the key of its Signature."""
-        return f"residues 3 {self.name}"
+        return f"residues 4 {self.name}"
 
     def __call__(self, body: BodyRef, points: Floats) -> Floats:
         """Return values (P,) or (P, C) at points (P, 3), Å; raise a MeshError if the body has no such values."""
