@@ -193,7 +193,7 @@ class ResidueAttribute:
 
     def cache_tag(self, body: BodyRef) -> str:
         """Return the name. The molecule is the body's own file, which is part of the key of its Signature."""
-        return f"residues 4 {self.name}"
+        return f"residues 5 {self.name}"
 
     def __call__(self, body: BodyRef, points: Floats) -> Floats:
         """Return values (P,) or (P, C) at points (P, 3), Å; raise a MeshError if the body has no such values."""
