@@ -11,7 +11,7 @@ from typing import Any, overload
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._pytree import MappingKey, register_pytree_node, tree_map_only
+from torch.utils._pytree import KeyEntry, MappingKey, register_pytree_node, tree_map_only
 
 from igps._arrays import Floats, Singles
 from igps.data.indices import Indices, resolve_indices, scalar_index
@@ -342,7 +342,7 @@ def _flatten_samples(samples: SampleBatch) -> tuple[list[Any], None]:
     return [samples.points, samples.eigenfunctions, samples.mask, dict(samples.attributes)], None
 
 
-def _named(names: Sequence[str], values: Sequence[Any]) -> list[tuple[MappingKey[str, Any], Any]]:
+def _named(names: Sequence[str], values: Sequence[Any]) -> list[tuple[KeyEntry, Any]]:
     return [(MappingKey(name), value) for name, value in zip(names, values, strict=True)]
 
 

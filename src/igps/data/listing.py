@@ -36,8 +36,8 @@ class Listing:
                 continue
         known: dict[Path, bytes] = {}
         if self.cache_dir is not None:
-            files = (file for group in several.values() for file in group)
-            known = KnownFiles(self.cache_dir).digests(files)
+            all_files = (file for files in several.values() for file in files)
+            known = KnownFiles(self.cache_dir).digests(all_files)
         for path, files in several.items():
             if all(file in known for file in files):
                 content = Content.of_files({file: known[file] for file in files})
