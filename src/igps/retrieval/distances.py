@@ -9,14 +9,12 @@ unsuitable shapes, dtypes or devices, for NaN or infinity, and χ² for negative
 """
 
 import math
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.utils.checkpoint import checkpoint
 
 from igps._threads import Team
 from igps.retrieval.distance_loops import fill
@@ -25,10 +23,10 @@ Distance = Callable[[Tensor, Tensor], Tensor]
 """A distance function: queries (Q, ...) and gallery (G, ...) to distances (Q, G) ≥ 0, smaller is closer."""
 
 # A tile of (query, gallery, cell) triples fits the cache of a CPU, and makes few, large kernel launches on other
-# devices. A few temporaries of that size exist at once, so that they stay below 256 MiB on any device.
+# devices. At most three temporaries of that size exist at once, so that they stay below 256 MiB on any device.
 _CPU_TILE_BYTES = 2**20
+_DEVICE_TILE_BYTES = 48 * 2**20
 _CELLS_PER_TILE = 4096
-_DEVICE_TILE_BYTES = 24 * 2**20
 # Smallest number of triples per thread of the compiled loops, which takes some milliseconds.
 _TRIPLES_PER_THREAD = 2**24
 # Fewer triples take PyTorch less than ten milliseconds; to load the compiled loops takes half a second.
@@ -59,10 +57,9 @@ def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
         (Q, G) distances, without unit.
     """
     a, b = _as_rows(queries, gallery, non_negative=True)
-    needs_gradients = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
-    if needs_gradients or not _uses_loops(a, b):
+    if in_transforms():
         return _chi_square_by_torch(a, b)
-    return _sums_by_loops(a, b, chi_square=True).mul_(0.5)
+    return _ChiSquare.apply(a, b)
 
 
 def euclidean(queries: Tensor, gallery: Tensor) -> Tensor:
@@ -81,35 +78,50 @@ def cosine(queries: Tensor, gallery: Tensor) -> Tensor:
     return distance.square() / 2.0
 
 
+class _ChiSquare(torch.autograd.Function):
+    """χ² tile by tile. The backward pass recomputes the tiles, so that no array (Q, G, cells) is stored."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
+        ctx.save_for_backward(a, b)
+        if _uses_loops(a, b):
+            return _sums_by_loops(a, b, chi_square=True).mul_(0.5)
+        distances = a.new_zeros(len(a), len(b))
+        for q, g, c in _tiles(a, b):
+            ratio, difference = _ratio(a[q, c], b[g, c])
+            distances[q, g] += ratio.mul_(difference).sum(-1)
+        return distances.mul_(0.5)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        a, b = ctx.saved_tensors
+        if torch.is_grad_enabled():  # derivatives of the gradient are needed, too
+            distances = _chi_square_by_torch(a, b)
+            first_is_needed, second_is_needed = ctx.needs_input_grad
+            gradients: list[Tensor | None] = [None, None]
+            for i, is_needed in enumerate((first_is_needed, second_is_needed)):
+                if is_needed:
+                    leaf = (a, b)[i]
+                    (gradients[i],) = torch.autograd.grad(distances, leaf, grad, create_graph=True)
+            return tuple(gradients)
+        grad_a = torch.zeros_like(a)
+        grad_b = torch.zeros_like(b)
+        for q, g, c in _tiles(a, b):
+            # With u = (a−b)/(a+b): ∂/∂a (a−b)²/(a+b) = 2u − u², and ∂/∂b = −2u − u².
+            ratio, _ = _ratio(a[q, c], b[g, c])
+            first = ratio * grad[q, g, None]
+            second = ratio.mul_(first)
+            grad_a[q, c] += first.sum(1) - second.sum(1) / 2
+            grad_b[g, c] -= first.sum(0) + second.sum(0) / 2
+        return grad_a, grad_b
+
+
 def _chi_square_by_torch(a: Tensor, b: Tensor) -> Tensor:
-    """χ² in operations of PyTorch, which have derivatives of any order.
-
-    The gradient computes each tile again, so that no array (Q, G, cells) is stored.
-    """
-    if torch.compiler.is_compiling() or in_transforms():
-        return _chi_square_of_tile(a, b)
-    again = partial(checkpoint, use_reentrant=False, preserve_rng_state=False)
-    total = a.new_zeros(len(a), len(b))
-    n_cells = min(a.shape[1], _CELLS_PER_TILE)
-    rows, columns = _tile_size(a, b, n_cells)
-    for one, other in zip(a.split(n_cells, dim=1), b.split(n_cells, dim=1), strict=True):
-        strips = []
-        for queries in one.split(rows):
-            tiles = [
-                again(_chi_square_of_tile, queries, gallery) for gallery in other.split(columns)
-            ]
-            strips.append(torch.cat(tiles, dim=1))
-        total = total + torch.cat(strips)
-    return total
-
-
-def _chi_square_of_tile(a: Tensor, b: Tensor) -> Tensor:
+    """χ² in operations of PyTorch, which have derivatives of any order and hold arrays (Q, G, cells)."""
     total = a[:, None] + b
-    is_filled = total > 0
-    difference = torch.where(is_filled, a[:, None] - b, 0)
-    # The division comes first: the square of a small number may be 0
-    ratio = difference / torch.where(is_filled, total, 1)
-    return (ratio * difference).sum(dim=-1) / 2
+    filled = total > 0
+    difference = torch.where(filled, a[:, None] - b, 0)
+    return (difference.square() / torch.where(filled, total, 1)).sum(dim=-1) / 2
 
 
 def _uses_loops(a: Tensor, b: Tensor) -> bool:
@@ -148,13 +160,30 @@ def _sums_by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
     return sums
 
 
-def _tile_size(a: Tensor, b: Tensor, n_cells: int) -> tuple[int, int]:
-    """Return numbers of queries and gallery rows of which an array of `n_cells` cells has a bounded size."""
+def _ratio(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """(a−b)/(a+b), 0 where both are 0, and a−b for all pairs of rows, each (Q, G, cells)."""
+    difference = a[:, None] - b
+    total = a[:, None] + b
+    total.clamp_min_(torch.finfo(a.dtype).tiny)  # 0/tiny = 0: an empty cell needs no mask
+    ratio = torch.div(difference, total, out=total)
+    return ratio, difference
+
+
+def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
+    """Slices (queries, gallery, cells) of tiles of bounded size that cover all triples."""
+    n_queries, n_cells = a.shape
+    n_gallery = len(b)
     n_bytes = _CPU_TILE_BYTES if a.device.type == "cpu" else _DEVICE_TILE_BYTES
-    pairs = max(1, n_bytes // (n_cells * a.element_size()))
+    cells = min(n_cells, _CELLS_PER_TILE)
+    pairs = max(1, n_bytes // (cells * a.element_size()))
     # As many rows as columns, or more if the gallery is short.
-    rows = max(math.isqrt(pairs), pairs // max(1, len(b)))
-    return rows, max(1, pairs // rows)
+    rows = max(math.isqrt(pairs), pairs // max(1, n_gallery))
+    rows = max(1, min(n_queries, rows))
+    columns = max(1, min(n_gallery, pairs // rows))
+    for q in range(0, n_queries, rows):
+        for g in range(0, n_gallery, columns):
+            for c in range(0, n_cells, cells):
+                yield slice(q, q + rows), slice(g, g + columns), slice(c, c + cells)
 
 
 def _row_distance(a: Tensor, b: Tensor) -> Tensor:
