@@ -2,6 +2,7 @@
 
     python -m docs.benchmarks.learning splits ROOT --protocol seen --out build/splits.json
     python -m docs.benchmarks.learning fitted ROOT
+    python -m docs.benchmarks.learning plain ROOT
 
 Heads with fixed parameters are fitted to the training part of each split, and the test part is scored once.
 """
@@ -83,6 +84,40 @@ def splits(
         earlier = json.loads(out.read_text()) if out.exists() else []
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps([*earlier, *rows], indent=1) + "\n")
+
+
+def plain(
+    root: Path,
+    descriptor: str = "measures",
+    n_train: int = 10,
+    seeds: Sequence[int] = SEEDS,
+    cache_dir: Path | None = None,
+) -> None:
+    """Print the scores of plain numbers, to which nothing is fitted, on the test parts of the same splits.
+
+    Args:
+        root: labelled collection.
+        descriptor: "measures", or "measures+size".
+        n_train: shapes of each class (seen) or classes (unseen) that are left out.
+        seeds: seed of each split.
+        cache_dir: folder of cached signatures; by default the user's cache directory.
+    """
+    module = igps.descriptor(descriptor)
+    dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=module)
+    dataset.precompute(strict=True)
+    vectors = describe(dataset, module)
+    protocols: tuple[SplitProtocol, ...] = ("seen", "unseen")
+    for protocol in protocols:
+        scores = []
+        for seed in seeds:
+            test = torch.tensor(draw_split(dataset, protocol, n_train, seed).test)
+            distances = module.distances(vectors[test], vectors[test])
+            scores.append(retrieval_scores(distances, dataset.labels[test]).mean())
+        for column, title in COLUMNS.items():
+            value = spread([one[column] for one in scores])
+            print(
+                f"{protocol:<8}{title:<6}{100 * value['mean']:>6.1f} ± {100 * value['stdev']:.1f}"
+            )
 
 
 def fitted(
@@ -181,4 +216,4 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 
 if __name__ == "__main__":
     with errors_as_messages():
-        auto_cli([splits, fitted])
+        auto_cli([splits, fitted, plain])
