@@ -22,8 +22,8 @@ import trimesh
 from damage import broken_bytes
 from numpy.typing import NDArray
 
-TESTS = Path(__file__).parents[1]
-sys.path += [str(TESTS.parent), str(TESTS)]
+sys.path.append(str(Path(__file__).parents[1]))
+sys.path.append(str(Path(__file__).parents[2]))
 from tests.fields.cad.step_files import write_step
 from tests.fields.volumes import test_volumes
 

@@ -55,7 +55,7 @@ class Cache:
     """Cache of records by key, which any number of processes can share.
 
     Files are written atomically, so a reader sees a whole file or none. Partial files of killed processes are removed
-    after a day, when another file is written beside them. Processes that compute the same value write the same bytes.
+    after a day, see `remove_abandoned`. Processes that compute the same value write the same bytes.
     Permissions follow the umask. The directory is created if it is missing.
     """
 
@@ -116,7 +116,6 @@ class Cache:
         path = self.path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         texts = {**record.texts, "format": _FORMAT, "key": key, "checksum": checksum(record)}
-        _remove_abandoned(path.parent)
         # safetensors writes the memory of arrays, so they must be contiguous
         arrays = {name: np.ascontiguousarray(values) for name, values in record.arrays.items()}
         try:
@@ -131,6 +130,15 @@ class Cache:
                 raise
             # The error for a full disk names no file
             raise OSError(error.errno, error.strerror, str(path)) from error
+
+    def remove_abandoned(self) -> None:
+        """Remove partial files of killed processes that are older than a day."""
+        for partial in self.directory.glob(f"*/*{PARTIAL}"):
+            try:
+                if time.time() - partial.stat().st_mtime > _ABANDONED_AGE:
+                    partial.unlink()
+            except OSError:  # removed by another process, or owned by another user
+                continue
 
 
 def encode(signature: Signature) -> Record:
@@ -166,16 +174,6 @@ def decode(record: Record) -> Signature:
         points = record.arrays[f"{kind}.points"]
         fields[kind] = Samples(points, record.arrays[f"{kind}.eigenfunctions"], attributes)
     return Signature(record.arrays["eigenvalues"], config=SignatureConfig(**config), **fields)
-
-
-def _remove_abandoned(folder: Path) -> None:
-    """Remove partial files of killed processes that are older than a day."""
-    for partial in folder.glob(f"*{PARTIAL}"):
-        try:
-            if time.time() - partial.stat().st_mtime > _ABANDONED_AGE:
-                partial.unlink()
-        except OSError:  # removed by another process, or owned by another user
-            continue
 
 
 def checksum(record: Record) -> str:

@@ -12,11 +12,13 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 from igps._parallel import run
 from igps._progress import Progress
 from igps._text import counted
 from igps._threads import n_cores
+from igps.data.cache import Kind
 from igps.data.cache_hit import CacheHit
 from igps.data.known_files import KnownFiles
 from igps.data.pipeline import SignaturePipeline, fill_elsewhere, version
@@ -77,6 +79,8 @@ def fill(
     except OSError as error:
         cause = f"cache_dir: {pipeline.cache_dir} cannot be created ({error.strerror})"
         raise MachineError(f"{cause}. Choose a writable folder and run again.") from error
+    for kind in get_args(Kind):
+        pipeline.cache(kind).remove_abandoned()
     found = find_cached(pipeline, bodies)
     hits = [None if isinstance(outcome, Failed) else outcome for outcome in found]
     failures: dict[int, Failure] = {}
