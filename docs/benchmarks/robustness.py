@@ -1,6 +1,6 @@
 """How far descriptions move when a mesh is disturbed, or when a body takes another pose: the table of robustness.md.
 
-python -m docs.benchmarks.robustness MESH... --gallery ROOT --poses POSES
+python -m docs.benchmarks.robustness MESHES ROOT --poses POSES
 """
 
 from __future__ import annotations
