@@ -416,7 +416,7 @@ def epoch(data):
         with two_versions("epochs.py", root, VERSION_0_2_0) as seconds_of:
             without_workers, before = seconds_of("0")
             with_workers, before_with_workers = seconds_of("2")
-    note = "400 items of 20 generated bodies, batches of 16; ours from one file, without meshes"
+    note = "400 items of 20 generated bodies, batches of 16"
     figures["epoch"] = Figure(
         without_workers, "s", before, "version 0.2.0", before / without_workers, note
     )
