@@ -67,7 +67,7 @@ class ClassifierHead(KernelHead, ClassifyingHead):
     class of a shape is unknown if its strangeness is at least the 95th percentile of held-out shapes.
 
     Args:
-        prior: see `KernelHead`, whose other numbers are its own.
+        prior: see `KernelHead`; all its other parameters have their defaults.
         names: of the classes, in the order of their numbers.
     """
 
