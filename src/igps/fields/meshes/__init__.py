@@ -1,6 +1,5 @@
-"""Surfaces: files of triangles and polygons, scenes, archives, and values at vertices."""
+"""Surfaces: files of triangles and polygons, scenes, and archives."""
 
-from igps.data.attribute_sources import SourceKind
 from igps.fields.meshes import (
     archives,
     brains,
@@ -11,7 +10,6 @@ from igps.fields.meshes import (
     scenes,
     stl,
     threemf,
-    vertex_attributes,
     vtk,
 )
 
@@ -31,4 +29,3 @@ FORMATS = (
     archives.ARCHIVE,
     archives.COMPRESSED,
 )
-ATTRIBUTES = (SourceKind(vertex_attributes.VertexAttribute, suffixes=("",)),)
