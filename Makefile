@@ -23,8 +23,8 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# make campaign [SMALL=1]: broken meshes and bodies, killed processes, machine faults, properties; less
-# than half an hour on two cores. SMALL=1 takes two minutes and leaves out machine faults.
+# make campaign [SMALL=1]: broken meshes and bodies, killed processes; less than half an hour on two cores. SMALL=1
+# takes a minute.
 campaign: $(READY)
 	$(BIN)/python tests/campaign/campaign.py $(if $(SMALL),--small)
 

@@ -8,15 +8,16 @@ from __future__ import annotations
 import gzip
 import sys
 import tempfile
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import gemmi
+import gridData
 import nibabel
 import numpy as np
+import SimpleITK
 import tifffile
 import trimesh
 from damage import broken_bytes
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 sys.path.append(str(Path(__file__).parents[1]))
 sys.path.append(str(Path(__file__).parents[2]))
 from tests.fields.cad.step_files import write_step
+from tests.fields.molecules.test_molecules import Atom
 from tests.fields.volumes import test_volumes
 
 Array = NDArray[Any]
@@ -131,49 +133,18 @@ def _volume(generator):
 
 
 def written_volume(suffix, values, affine):
-    """Write an array, valid or not, in a format."""
-    if suffix in ("nii", "nii.gz"):
-        image = nibabel.Nifti1Image(values, None, dtype=values.dtype)
-        for row, words in zip("xyz", affine, strict=False):
-            image.header[f"srow_{row}"] = words
-        image.header["sform_code"] = 1
-        content = image.to_bytes()
-        return gzip.compress(content, mtime=0) if suffix == "nii.gz" else content
-    if suffix == "mgz":
-        return gzip.compress(nibabel.MGHImage(values, affine).to_bytes(), mtime=0)
-    if suffix == "tif":
-        with tempfile.NamedTemporaryFile(suffix=".tif") as file:
-            tifffile.imwrite(file.name, np.ascontiguousarray(values.T), photometric="minisblack")
-            return Path(file.name).read_bytes()
-    lps = np.diag([-1, -1, 1, 1]) @ affine
-    raw = np.asfortranarray(values).tobytes(order="F")
-    sizes = " ".join(map(str, values.shape))
-    axes = lps[:3, :3].T
-    if suffix == "mha":
-        kinds = {"int16": "MET_SHORT", "float32": "MET_FLOAT", "float64": "MET_DOUBLE"}
-        sides = np.linalg.norm(axes, axis=1)
-        zeros = [0.0] * (values.ndim - 3)
-        directions = np.eye(values.ndim)
-        directions[:3, :3] = axes / sides[:, None]
-        rows = (
-            f"ObjectType = Image\nNDims = {values.ndim}\nBinaryData = True\nBinaryDataByteOrderMSB = False\n"
-            f"TransformMatrix = {_words(directions.ravel())}\nOffset = {_words([*lps[:3, 3], *zeros])}\n"
-            f"ElementSpacing = {_words([*sides, *(1 + x for x in zeros)])}\nDimSize = {sizes}\n"
-            f"ElementType = {kinds[str(values.dtype)]}\nElementDataFile = LOCAL\n"
-        )
-        return rows.encode() + raw
-    kinds = {"int16": "short", "float32": "float", "float64": "double"}
-    space = " ".join(f"({','.join(map(str, axis))})" for axis in axes) + " none" * (values.ndim - 3)
-    rows = (
-        f"NRRD0004\ntype: {kinds[str(values.dtype)]}\ndimension: {values.ndim}\nspace: left-posterior-superior\n"
-        f"sizes: {sizes}\nspace directions: {space}\nkinds:{' domain' * 3}{' list' * (values.ndim - 3)}\n"
-        f"endian: little\nencoding: gzip\nspace origin: ({','.join(map(str, lps[:3, 3]))})\n\n"
-    )
-    return rows.encode() + gzip.compress(raw, mtime=0)
-
-
-def _words(numbers):
-    return " ".join(repr(float(x)) for x in numbers)
+    """Write an array in a format."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"x.{suffix}"
+        if suffix in ("nii", "nii.gz", "mgz"):
+            kind = nibabel.MGHImage if suffix == "mgz" else nibabel.Nifti1Image
+            kind(values, affine).to_filename(path)
+        elif suffix == "tif":
+            tifffile.imwrite(path, np.ascontiguousarray(values.T), photometric="minisblack")
+        else:
+            image = test_volumes.itk_image(values, affine)
+            SimpleITK.WriteImage(image, str(path), useCompression=True)
+        return path.read_bytes()
 
 
 @cache
@@ -214,31 +185,10 @@ def helices():
                 serial += 1
                 angle = np.radians(100 * i + turn)
                 at = (x + radius * np.cos(angle), radius * np.sin(angle), 1.5 * i + up)
-                lines.append(Atom(serial, name, residue, chain, i + 1, at).line())
+                atom = Atom(serial, name, *at, residue, chain, place=f"{i + 1:>4} ")
+                lines.append(atom.line().rstrip())
         lines.append("TER")
     return tuple(lines)
-
-
-@dataclass(frozen=True)
-class Atom:
-    """An atom of a PDB file, at its place in a chain."""
-
-    serial: int
-    name: str
-    residue: str
-    chain: str
-    number: int
-    at: Iterable[float]
-    record: str = "ATOM"
-
-    def line(self):
-        """The line of the atom in the file."""
-        position = "".join(f"{x:8.3f}"[:8] for x in self.at)
-        return (
-            f"{self.record:<6}{self.serial:>5} {f' {self.name}':<4} {self.residue:>3} "
-            f"{self.chain}{self.number:>4}    {position}"
-            f"{1:6.2f}{20:6.2f}          {self.name[0]:>2}"
-        )
 
 
 def _molecule(generator):
@@ -341,34 +291,8 @@ def _grid(suffix):
     shape = np.array([17, 15, 21])
     origin = -side * (shape - 1) / 2
     places = np.stack(np.indices(tuple(shape)), axis=-1) * side + origin
-    values = field_at(places).astype(np.float32)
-    if suffix == "dx":
-        rows = [
-            "# data of a potential",
-            f"object 1 class gridpositions counts {_integers(shape)}",
-            f"origin {_words(origin)}",
-            *(f"delta {_words(row)}" for row in np.diag(side)),
-            f"object 2 class gridconnections counts {_integers(shape)}",
-            f"object 3 class array type double rank 0 items {values.size} data follows",
-            *(
-                " ".join(f"{x:.6e}" for x in row)
-                for row in np.array_split(values.ravel(), values.size // 3)
-            ),
-            'attribute "dep" string "positions"',
-        ]
-        return "\n".join([*rows, ""]).encode()
-    head = np.zeros(256, "<i4")
-    head[:3] = shape
-    head[3] = 2
-    head[7:10] = shape
-    head[16:19] = (1, 2, 3)
-    floats = head.view("<f4")
-    floats[10:13] = side * shape
-    floats[13:16] = 90
-    floats[49:52] = origin
-    head[52:54] = np.frombuffer(b"MAP \x44\x44\0\0", "<i4")
-    return head.tobytes() + values.astype("<f4").tobytes(order="F")
-
-
-def _integers(numbers):
-    return " ".join(str(int(x)) for x in numbers)
+    grid = gridData.Grid(field_at(places), origin=origin, delta=side)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / ("x.dx" if suffix == "dx" else "x.mrc")
+        grid.export(str(path))
+        return path.read_bytes()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import subprocess
 import sys
 import types
 from pathlib import Path
@@ -45,41 +44,10 @@ def write_shapes(folder):
 def arguments(shapes, cache, out, n_workers):
     """Arguments of the command, without its name."""
     signature = {"n_eigenpairs": 6, "resolution": 10, "min_samples": 0, "n_surface_samples": 20}
-    return [
-        *(
-            "retrieve",
-            str(shapes),
-            "--descriptor",
-            "cheap_descriptor:cheap",
-            "--n_workers",
-            str(n_workers),
-        ),
-        *("--cache_dir", str(cache), "--out", str(out)),
-        *(
-            word
-            for name, value in signature.items()
-            for word in (f"--signature.{name}", str(value))
-        ),
-    ]
-
-
-def environment(fault=""):
-    """Environment of a command that can import the descriptor, with a fault of the machine if one is named."""
-    paths = [
-        str(HERE),
-        *([str(HERE / "shims")] if fault else []),
-        *sys.path,
-    ]
-    path = os.pathsep.join(dict.fromkeys(path for path in paths if path))
-    return {**os.environ, "PYTHONPATH": path, "IGPS_CAMPAIGN_FAULT": fault, "OMP_NUM_THREADS": "1"}
-
-
-def retrieve(shapes, cache, out, n_workers=1, fault="", under=()):
-    """Run the command to its end, with a fault of the machine, or under another command."""
-    command = [*under, sys.executable, "-m", "igps", *arguments(shapes, cache, out, n_workers)]
-    return subprocess.run(
-        command, env=environment(fault), capture_output=True, text=True, timeout=300, check=False
-    )
+    words = ["retrieve", str(shapes), "--descriptor", "cheap_descriptor:cheap"]
+    words += ["--n_workers", str(n_workers), "--cache_dir", str(cache), "--out", str(out)]
+    words += [f"--signature.{name}={value}" for name, value in signature.items()]
+    return words
 
 
 class Command:
@@ -124,7 +92,7 @@ def _become(words, log):
         sys.argv = words
         # Workers import the main module. Without this line, it would be a module of the campaign.
         sys.modules["__main__"] = types.ModuleType("__main__")
-        os.environ.update(environment())
+        os.environ["PYTHONPATH"] = os.pathsep.join([str(HERE), *filter(None, sys.path)])
         sys.path.insert(0, str(HERE))
         torch.set_num_threads(1)
         main = _command()
