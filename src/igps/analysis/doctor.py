@@ -24,7 +24,7 @@ from igps.mesh.mesh import check_arrays
 from igps.mesh.raw_body import RawBody, UnitSource
 from igps.mesh.surface import face_parts
 
-# Seconds and bytes of a signature on one core, by vertices and eigenpairs, as fitted by tests/benchmarks/cost.py to 62
+# Seconds and bytes of a signature on one core, by vertices and eigenpairs, as fitted by docs/benchmarks/cost.py to 62
 # signatures of 31 generated bodies with 770 to 119,000 vertices, with 50 and 250 eigenpairs. For bodies left out of the
 # fit, 97 % of the times are within a factor of 1.5 of the prediction, 90 % within 1.28, and the memory within 1.05. The
 # memory includes that of the process before it reads a file; the constant time includes what a process pays once, such

@@ -1,4 +1,4 @@
-"""A gallery of a million bodies: `PYTHONPATH=. python tests/benchmarks/million.py`, with `--n`, `--folder`, `--seed`.
+"""A gallery of a million bodies: `python -m docs.benchmarks.million`, with `--n`, `--folder`, `--seed`.
 
 600 generated bodies of 12 classes are described by `pretrained`. A row is a mixture of four bodies of a class with a
 little of any other body and noise. The script prints the cost of building the gallery, and the time and the recall at

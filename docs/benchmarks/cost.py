@@ -1,4 +1,4 @@
-"""Cost of a signature by vertices and eigenpairs, for `igps doctor`: `python tests/benchmarks/cost.py`.
+"""Cost of a signature by vertices and eigenpairs, for `igps doctor`: `python -m docs.benchmarks.cost`.
 
 The script measures processor time and peak memory of the signatures of generated bodies, each in a separate process on
 one thread. It fits the constants of `igps.analysis.doctor`, and prints them in the form of that module, with their
