@@ -1,6 +1,8 @@
 """Meshes and data that several tests use."""
 
 import contextlib
+import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 import torch
 import trimesh
 from matplotlib.figure import Figure
+from threadpoolctl import threadpool_limits
 
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
@@ -16,6 +19,8 @@ from page_packages import install
 
 # The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
 torch.set_num_threads(1)
+threadpool_limits(1, "blas")  # of libraries that are loaded already, others heed the variable
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -139,41 +144,33 @@ def as_trimesh(mesh):
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
-def horseshoe(half_gap=0.05, tube=0.3, n_sections=48, n_around=14):
-    """A ring that is open by twice `half_gap` radians, with flat ends, without any symmetry."""
-    jitter = np.random.default_rng(0).uniform(0.9, 1.1, (n_sections, n_around))
-    u = np.linspace(half_gap, 2 * np.pi - half_gap, n_sections)[:, None]
-    v = np.arange(n_around)[None, :] * (2 * np.pi / n_around)
-    radius = 1 + tube * jitter * np.cos(v)
-    ring = np.stack(
-        [radius * np.cos(u), radius * np.sin(u), tube * jitter * np.sin(v)],
-        axis=2,
-    )
-    ring = ring.reshape(-1, 3)
-    ends = np.stack(
-        [np.cos(u[[0, -1], 0]), np.sin(u[[0, -1], 0]), np.zeros(2)],
-        axis=1,
-    )
-    i, j = np.mgrid[: n_sections - 1, :n_around]
+def tube(rings, ends):
+    """A tube through rings of points (R, N, 3), closed by fans about two end points (2, 3)."""
+    n_rings, n_around, _ = rings.shape
+    i, j = np.mgrid[: n_rings - 1, :n_around]
     a = i * n_around + j
     b = i * n_around + (j + 1) % n_around
     lower = np.stack([a, a + n_around, b], axis=-1)
     upper = np.stack([b, a + n_around, b + n_around], axis=-1)
     here = np.arange(n_around)
     there = (here + 1) % n_around
-    last = (n_sections - 1) * n_around
-    n = n_sections * n_around
-    first_cap = np.stack(
-        [here, there, np.full(n_around, n)],
-        axis=1,
-    )
-    last_cap = np.stack(
-        [last + there, last + here, np.full(n_around, n + 1)],
-        axis=1,
-    )
-    parts = (lower, upper, first_cap, last_cap)
-    faces = np.concatenate([part.reshape(-1, 3) for part in parts])
-    return Mesh(np.concatenate([ring, ends]), faces, name="horseshoe")
+    last = (n_rings - 1) * n_around
+    middle = np.full(n_around, n_rings * n_around)
+    first_cap = np.stack([here, there, middle], axis=1)
+    last_cap = np.stack([last + there, last + here, middle + 1], axis=1)
+    faces = [part.reshape(-1, 3) for part in (lower, upper, first_cap, last_cap)]
+    return Mesh(np.concatenate([rings.reshape(-1, 3), ends]), np.concatenate(faces))
+
+
+def horseshoe(half_gap=0.05, radius=0.3, n_sections=48, n_around=14):
+    """A ring that is open by twice `half_gap` radians, with flat ends, without any symmetry."""
+    jitter = np.random.default_rng(0).uniform(0.9, 1.1, (n_sections, n_around))
+    u = np.linspace(half_gap, 2 * np.pi - half_gap, n_sections)[:, None]
+    v = np.arange(n_around)[None, :] * (2 * np.pi / n_around)
+    away = 1 + radius * jitter * np.cos(v)
+    rings = np.stack([away * np.cos(u), away * np.sin(u), radius * jitter * np.sin(v)], axis=2)
+    ends = np.stack([np.cos(u[[0, -1], 0]), np.sin(u[[0, -1], 0]), np.zeros(2)], axis=1)
+    return replace(tube(rings, ends), name="horseshoe")
 
 
 def with_slivers(vertices, faces, n_slivers):
