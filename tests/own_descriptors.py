@@ -18,6 +18,7 @@ from igps.data.requirements import Requirements
 from igps.descriptors.gps import gps
 from igps.descriptors.interior import interior
 
+CONFIG = igps.SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 SMALL = [
     "--signature.n_eigenpairs",
     "20",
@@ -27,6 +28,7 @@ SMALL = [
     "0",
 ]
 SMALL += ["--signature.n_surface_samples", "60", "--n_workers", "1"]
+"""The options of the same."""
 
 
 def changed(descriptor, **numbers):

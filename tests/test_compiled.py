@@ -28,14 +28,12 @@ def largest_sum(rows):
 
 def test_a_compiled_loop_may_call_another():
     rows = np.random.default_rng(1).random((7, 40))
-    expected = pytest.approx(rows.sum(axis=1).max())
-    assert largest_sum(rows) == expected
+    assert largest_sum(rows) == pytest.approx(rows.sum(axis=1).max())
 
 
 def test_a_compiled_loop_is_the_function_that_it_was_made_of():
     values = np.random.default_rng(0).random(1000)
-    expected = np.cumsum(values)
-    np.testing.assert_allclose(cumulative(values), expected, rtol=1e-12)
+    np.testing.assert_allclose(cumulative(values), np.cumsum(values), rtol=1e-12)
     assert cumulative.__name__ == "cumulative"
 
 

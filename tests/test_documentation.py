@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from sklearn.svm import SVC
 
 import commands
@@ -25,7 +24,6 @@ import igps
 from igps.cli.commands import command_of, load_command
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES
-from igps.shapes import ArticulatedShapes
 from page_packages import install
 from paper_histogram import paper_histogram
 
@@ -168,27 +166,6 @@ def test_the_twenty_lines_print_scores_and_the_nearest_and_train_a_layout(folder
     expected = [dataset.bodies.names[i] for i in np.argsort(distances[0], kind="stable")[:3]]
     assert ast.literal_eval(nearest) == expected
     assert expected[0] == dataset.bodies.names[0]
-
-
-def test_the_descriptor_of_ones_own_runs_by_its_place(folder):
-    page = python("docs/how-to/add-descriptor.md")
-    (mine,) = [block for block in page if block.title == "mine.py"]
-    (folder / "mine.py").write_text(mine.text)
-    ArticulatedShapes(n_classes=2, n_per_class=3, n_vertices=600).write(folder / "shapes")
-    options = ["--signature.n_eigenpairs", "5", "--n_workers", "1"]
-    options += ["--cache_dir", "cache", "--out", "out"]
-    words = ["retrieve", "shapes", "--descriptor", "mine:Roundness", *options]
-    commands.run(*words)
-    with np.load(folder / "out" / "distances.npz") as archive:
-        distances = archive["distances"]
-        names = archive["names"]
-        labels = archive["labels"]
-    bodies = [trimesh.load(folder / "shapes" / name) for name in names]
-    roundness = np.array([abs(body.volume) / body.area**1.5 for body in bodies])
-    expected = np.abs(roundness[:, None] - roundness)
-    np.testing.assert_allclose(distances, expected, atol=1e-6)
-    scores = json.loads((folder / "out" / "scores.json").read_text())
-    assert (scores["nn"], scores["ft"]) == pytest.approx(first_tier(distances, list(labels)))
 
 
 def runs_here(page):

@@ -129,14 +129,12 @@ def test_workers_leave_it_to_their_parent_while_they_start(tmp_path):
 
 
 def test_workers_have_one_thread(results):
-    found = {results[number][1] for number in (8, 9)}
-    assert found == {"1"}
+    assert {results[number][1] for number in (8, 9)} == {"1"}
 
 
 def test_nothing_to_do():
     assert all_of(jobs.square, [], n_workers=4) == {}
-    found = all_of(jobs.square, [], n_workers=4, limits=Limits(seconds=1))
-    assert found == {}
+    assert all_of(jobs.square, [], n_workers=4, limits=Limits(seconds=1)) == {}
 
 
 def test_fewer_than_one_worker_is_refused():
@@ -148,8 +146,7 @@ def test_fewer_than_one_worker_is_refused():
 
 
 def test_one_worker_is_this_process_unless_there_are_limits(limited):
-    found = all_of(jobs.process, [0, 0], n_workers=1)[1][0]
-    assert found == os.getpid()
+    assert all_of(jobs.process, [0, 0], n_workers=1)[1][0] == os.getpid()
     assert limited[0][0] == limited[1][0] != os.getpid()
 
 
@@ -220,8 +217,7 @@ def test_the_machine_is_not_the_jobs_fault(where, job, message):
 
 def test_other_errors_of_the_system_are_those_of_a_job():
     failed = Failed("FileNotFoundError: [Errno 2] ENOENT")
-    found = all_of(jobs.fail_with, [errno.ENOENT], n_workers=1)
-    assert found == {0: failed}
+    assert all_of(jobs.fail_with, [errno.ENOENT], n_workers=1) == {0: failed}
 
 
 @pytest.mark.parametrize(

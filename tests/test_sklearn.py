@@ -1,5 +1,3 @@
-from functools import cache
-
 import numpy as np
 import pytest
 import trimesh
@@ -9,14 +7,12 @@ from sklearn.exceptions import NotFittedError
 from sklearn.model_selection import GridSearchCV
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.pipeline import make_pipeline, make_union
-from sklearn.utils import check_array, estimator_checks
-from sklearn.utils.estimator_checks import check_estimator
+from sklearn.utils import estimator_checks
 
 from igps.data.dataset import SignatureDataset
 from igps.descriptors.interior import interior
 from igps.descriptors.literature.d2 import D2
 from igps.mesh.loading import load_mesh
-from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.signature.signature import SignatureConfig
@@ -25,8 +21,6 @@ from label_files import write_nifti
 from own_descriptors import changed
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=12, min_samples=0, n_surface_samples=20)
-# For the many fits of scikit-learn's own checks.
-TINY = SignatureConfig(n_eigenpairs=3, resolution=4, min_samples=0, n_surface_samples=20)
 DISTANCES = changed(D2(), n_bins=8)
 
 
@@ -52,9 +46,7 @@ def features(tmp_path):
 def test_features_are_the_roots_of_the_histograms(paths, features, tmp_path):
     dataset = SignatureDataset(paths, CONFIG, tmp_path)
     histograms = describe(dataset, interior(n_eigenpairs=20)).flatten(1).numpy()
-    found = features.fit_transform(paths)
-    expected = np.sqrt(histograms)
-    assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(features.fit_transform(paths), np.sqrt(histograms), atol=1e-6)
     plain = clone(features).set_params(square_root=False)
     found = plain.transform([str(path) for path in paths])
     assert_allclose(found, histograms, atol=1e-6)
@@ -70,8 +62,7 @@ def test_meshes_give_what_their_files_give(paths, features):
 def test_rich_features_bring_their_attributes(paths, tmp_path):
     rich = VolumetricFeatures("rich", cache_dir=tmp_path, n_workers=1).transform(paths[:1])
     assert rich.shape == (1, 27420)
-    found = (rich**2).sum()
-    assert_allclose(found, 1, rtol=1e-4)
+    assert_allclose((rich**2).sum(), 1, rtol=1e-4)
 
 
 def test_pipeline_classifies(paths, features):
@@ -80,8 +71,7 @@ def test_pipeline_classifies(paths, features):
         paths[::2],
         labels[::2],
     )
-    found = pipeline.score(paths[1::2], labels[1::2])
-    assert found == 1
+    assert pipeline.score(paths[1::2], labels[1::2]) == 1
 
 
 def test_other_input_is_refused(features):
@@ -135,8 +125,7 @@ def test_descriptions_that_are_no_histograms_are_given_as_they_are(paths, tmp_pa
         D2(),
         n_workers=1,
     )
-    found = features.transform(paths[:2])
-    assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(features.transform(paths[:2]), expected, atol=1e-6)
 
 
 def test_reading_is_passed_on(paths, tmp_path):
@@ -149,8 +138,7 @@ def test_reading_is_passed_on(paths, tmp_path):
     with pytest.raises(ValueError, match="torn"):
         features.transform([path])
     mended = features.set_params(reading=None).transform([path])
-    expected = features.transform(paths[:1])
-    assert_allclose(mended, expected, atol=0.05)
+    assert_allclose(mended, features.transform(paths[:1]), atol=0.05)
 
 
 @pytest.mark.parametrize("descriptor", [DISTANCES, interior(n_eigenpairs=3)])
@@ -160,8 +148,7 @@ def test_columns_have_names_and_tables_have_them(paths, tmp_path, descriptor):
         features.get_feature_names_out()
     values = features.fit(paths).transform(paths)
     names = features.get_feature_names_out()
-    expected = [f"{descriptor.name}{i}" for i in range(values.shape[1])]
-    assert names.tolist() == expected
+    assert names.tolist() == [f"{descriptor.name}{i}" for i in range(values.shape[1])]
     pandas = pytest.importorskip("pandas")
     table = clone(features).set_output(transform="pandas").fit_transform(paths)
     assert isinstance(table, pandas.DataFrame)
@@ -169,8 +156,7 @@ def test_columns_have_names_and_tables_have_them(paths, tmp_path, descriptor):
     assert_array_equal(table.to_numpy(), values)
     # Names of each have the name of the step before them
     union = make_union(clone(features), clone(features)).fit(paths)
-    found = len(set(union.get_feature_names_out()))
-    assert found == 2 * values.shape[1]
+    assert len(set(union.get_feature_names_out())) == 2 * values.shape[1]
 
 
 def test_parameters_are_searched(paths, features):
@@ -179,66 +165,6 @@ def test_parameters_are_searched(paths, features):
     grid = {"volumetricfeatures__square_root": [True, False]}
     found = GridSearchCV(pipeline, grid, cv=2, error_score="raise").fit(paths, labels)
     assert found.best_score_ == 1
-
-
-class OnRows(VolumetricFeatures):
-    """`VolumetricFeatures` for the checks of scikit-learn, which know tables of numbers: each row makes a mesh."""
-
-    def __init__(
-        self,
-        descriptor=DISTANCES,
-        *,
-        square_root=True,
-        config=TINY,
-        reading=None,
-        cache_dir=None,
-        n_workers=None,
-    ):
-        files = {"reading": reading, "cache_dir": cache_dir, "n_workers": n_workers}
-        super().__init__(descriptor, square_root=square_root, config=config, **files)
-
-    def fit(self, X, y=None):
-        return super().fit(meshes(X), y)
-
-    def transform(self, X):
-        return super().transform(meshes(X))
-
-    def __sklearn_tags__(self):
-        tags = super().__sklearn_tags__()
-        tags.input_tags.two_d_array = True
-        tags.input_tags.string = False
-        return tags
-
-
-def meshes(rows):
-    return [mesh_of_row(row.tobytes()) for row in check_array(rows, dtype=np.float64)]
-
-
-@cache
-def mesh_of_row(row):
-    """An ellipsoid whose half axes tell the first numbers of the row."""
-    numbers = np.resize(np.frombuffer(row), 3)
-    surface = trimesh.creation.icosphere(subdivisions=1)
-    return Mesh(
-        np.asarray(surface.vertices) * (1.5 + np.tanh(numbers)),
-        np.asarray(surface.faces),
-    )
-
-
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.SkipTestWarning")
-def test_conventions_of_scikit_learn():
-    """All its checks of a transformer, on meshes that are made of the rows of its tables."""
-    # Its defaults are objects; the test below has the real ones
-    known = {"check_parameters_default_constructible": "its defaults are objects"}
-    results = check_estimator(OnRows(), on_fail=None, on_skip=None, expected_failed_checks=known)
-    names = {}
-    for result in results:
-        names.setdefault(result["status"], set()).add(result["check_name"])
-    assert set(names) <= {"passed", "skipped", "xfail"}
-    assert names.get("xfail", set()) <= set(known)
-    assert len(names["passed"]) > 25
-    # What is left out asks for other libraries of arrays; nothing that is about transformers.
-    assert names.get("skipped", set()) <= {"check_array_api_input"}
 
 
 @pytest.mark.parametrize(

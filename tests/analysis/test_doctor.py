@@ -30,8 +30,7 @@ from igps.mesh.options import LoadOptions
 from igps.report.tables import findings_table
 from igps.signature.signature import SignatureConfig, compute_signature
 from label_files import write_nifti
-
-CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
+from own_descriptors import CONFIG
 
 
 def pipeline_of(root, reading=LoadOptions(), config=CONFIG):

@@ -181,7 +181,7 @@ def test_the_interval_covers_the_effect():
     # means 1 apart, two dimensions of variance 1
     truth = 0.25 / (0.25 + 2)
     covered = []
-    for draw in range(200):
+    for draw in range(100):
         vectors = random.normal(size=(80, 2)) + np.outer(np.repeat([0, 1], 40), [1, 0])
         test = quick(
             vectors,

@@ -89,12 +89,6 @@ def test_umap_puts_clusters_apart(tmp_path):
     assert cdist(found[:15], found[:15]).max() < cdist(found[:15], found[15:]).min()
 
 
-def test_without_umap_the_remedy_is_told(monkeypatch):
-    monkeypatch.setitem(sys.modules, "umap", None)
-    with pytest.raises(ImportError, match="umap-learn"):
-        body_map(np.ones((4, 4)), "umap")
-
-
 @pytest.mark.parametrize(
     ("distances", "match"),
     [

@@ -19,11 +19,9 @@ from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
 from igps.report.figures import clusters_figure, map_figure, write_analysis
 from igps.retrieval import chi_square
-from igps.signature.signature import SignatureConfig
 from label_files import write_nifti
-from own_descriptors import SMALL, small_interior, write_egg
+from own_descriptors import CONFIG, SMALL, small_interior, write_egg
 
-CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 OWN = ["--descriptor", "own_descriptors:small_interior"]
 
 

@@ -24,11 +24,9 @@ from igps.descriptors.registry import FIELD_NAMES
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.retrieval import chi_square, rerank, retrieval_scores
-from igps.signature.signature import SignatureConfig
-from own_descriptors import SMALL, small_interior
+from own_descriptors import CONFIG, SMALL, small_interior
 
 INTERIOR = "own_descriptors:small_interior"
-CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 
 
 @pytest.fixture

@@ -122,9 +122,8 @@ def test_every_option_has_help_and_no_python(name: str) -> None:
 
 
 def test_the_help_of_a_command_has_its_options_and_those_that_people_use(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit, match="0"):
         run("gallery", "build", "--help")
     text = " ".join(capsys.readouterr().out.split())

@@ -14,12 +14,10 @@ from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES, descriptor
 from igps.descriptors.registry import FIELD_NAMES
 from igps.shapes import ArticulatedShapes
-from igps.signature.signature import SignatureConfig
-from own_descriptors import SMALL, small_interior, write_egg
+from own_descriptors import CONFIG, SMALL, small_interior, write_egg
 
 KEYS = ["descriptor", "nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map"]
 KEYS += ["seconds_per_mesh", "n_models", "invariant_to"]
-CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 
 
 @pytest.fixture(scope="module")

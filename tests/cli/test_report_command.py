@@ -12,11 +12,9 @@ from commands import run
 from igps.report.page import render_page
 from igps.report.pictures import surfaces_of
 from igps.report.results import read_results, read_sources
-from igps.signature.signature import SignatureConfig
 from label_files import write_nifti
 from own_descriptors import SMALL, write_egg
 
-CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 INTERIOR = "own_descriptors:small_interior"
 
 

@@ -4,16 +4,15 @@ import gzip
 import logging
 import os
 import pickle
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bodies_on_disk import write_body
 from numpy.linalg import norm
 from numpy.testing import assert_allclose
 from trimesh.creation import icosphere
 
+from bodies_on_disk import write_body
 from igps.data.attribute_sources import (
     attribute_source,
     attribute_sources,
@@ -81,8 +80,7 @@ def body(tmp_path):
 def test_an_image_gives_a_linear_function_wherever_it_lies(body, suffix, write):
     write(body.path.with_name(f"egg{suffix}"), image())
     source = attribute_source(f"{{stem}}{suffix}")
-    found = source(body, INSIDE)
-    assert_allclose(found, linear(INSIDE), atol=1e-5)
+    assert_allclose(source(body, INSIDE), linear(INSIDE), atol=1e-5)
 
 
 @pytest.mark.parametrize("suffix", [".dx", ".mrc"])
@@ -117,8 +115,7 @@ def test_axes_of_a_map_in_another_order_are_put_right(body):
         file.header.mapr = 1
         file.header.maps = 2
         file.header.nxstart, file.header.nystart, file.header.nzstart = start[[2, 0, 1]]
-    found = attribute_source("a.map")(body, INSIDE)
-    assert_allclose(found, linear(INSIDE), atol=1e-4)
+    assert_allclose(attribute_source("a.map")(body, INSIDE), linear(INSIDE), atol=1e-4)
 
 
 @pytest.mark.parametrize("told", ["start", "both"])
@@ -137,8 +134,7 @@ def test_a_map_is_placed_by_its_origin_or_else_by_its_start(told, body):
             file.header.origin = tuple(0.5 * start)
         if told != "origin":
             file.header.nxstart, file.header.nystart, file.header.nzstart = start
-    found = attribute_source("a.mrc")(body, INSIDE)
-    assert_allclose(found, linear(INSIDE), atol=1e-4)
+    assert_allclose(attribute_source("a.mrc")(body, INSIDE), linear(INSIDE), atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -241,8 +237,7 @@ def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body):
     assert 0 < known.sum() < len(known)
     index = (INSIDE - AFFINE[:3, 3]) @ np.linalg.inv(AFFINE[:3, :3]).T
     whole = (index[:, 0] > 10) & (index[:, 2] > 8)
-    expected = linear(INSIDE)[whole]
-    assert_allclose(found[whole], expected, atol=1e-5)
+    assert_allclose(found[whole], linear(INSIDE)[whole], atol=1e-5)
     assert known[whole].all()
     assert np.abs(found[known]).max() < 10
 
@@ -431,15 +426,11 @@ def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path):
         path.write_bytes(content)
         points = np.array([[5.0, 0, 0], [8.0, 0, 0]])
         charge = ResidueAttribute("charge")
-        found = charge(BodyRef(path, "chain A"), points)
-        assert_allclose(found, 1.0, atol=1e-6)
-        found = charge(BodyRef(path, "chain B"), points)
-        assert_allclose(found, -1.0, atol=1e-6)
-        found = charge(BodyRef(path, "model"), points)
-        assert_allclose(found, 1.0, atol=1e-6)
+        assert_allclose(charge(BodyRef(path, "chain A"), points), 1.0, atol=1e-6)
+        assert_allclose(charge(BodyRef(path, "chain B"), points), -1.0, atol=1e-6)
+        assert_allclose(charge(BodyRef(path, "model"), points), 1.0, atol=1e-6)
         above = points + np.array([0, 0, 30])
-        found = charge(BodyRef(path), above)
-        assert_allclose(found, -1.0, atol=1e-6)
+        assert_allclose(charge(BodyRef(path), above), -1.0, atol=1e-6)
     write_body(tmp_path / "egg.off", 1, 1)
     with pytest.raises(
         MeshError, match=r"egg\.off: expected a PDB, mmCIF, BinaryCIF or PQR file for 'charge'"
@@ -475,8 +466,7 @@ def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(t
             f"ATOM      1  CA  {name} A   1       2.000   3.000   4.000  1.00 20.00           C\n"
         )
         os.utime(body.path, (1e9, 1e9))
-        found = ResidueAttribute("charge")(body, np.zeros((1, 3)))
-        assert_allclose(found, charge)
+        assert_allclose(ResidueAttribute("charge")(body, np.zeros((1, 3))), charge)
 
 
 def test_what_is_known_of_amino_acids_alone_is_refused_of_nucleotides_in_these_words(tmp_path):
@@ -504,27 +494,11 @@ def test_names_of_blocks_do_not_tell_what_a_body_is(tmp_path):
     for name in ("chain", "assembly"):
         for number, charge in ((1, 1.0), (2, -1.0)):
             body = BodyRef(tmp_path / "two.cif", f"{name} model {number}")
-            found = ResidueAttribute("charge")(body, np.zeros((1, 3)))
-            assert_allclose(found, charge)
-
-
-def stem_and_height(body, points):
-    return len(body.path.stem) + points[:, 2]
+            assert_allclose(ResidueAttribute("charge")(body, np.zeros((1, 3))), charge)
 
 
 def with_functions(folder, **functions):
     return SignatureDataset(folder / "shapes", CONFIG, folder / "cache", attributes=functions)
-
-
-def test_a_function_of_body_and_points_gives_an_attribute(tmp_path):
-    """Two copies of one file, which their names tell apart."""
-    write_body(tmp_path / "shapes" / "a.off", 0.8, 0.9)
-    shutil.copy(tmp_path / "shapes" / "a.off", tmp_path / "shapes" / "bbb.off")
-    dataset = with_functions(tmp_path, named=stem_and_height)
-    for item, n_letters in zip(dataset, (1, 3), strict=True):
-        samples = item.signature.interior
-        expected = n_letters + samples.points[:, 2]
-        assert_allclose(samples.attributes["named"], expected, atol=1e-5)
 
 
 def test_values_of_a_function_are_cached_under_its_tag(tmp_path):
@@ -572,5 +546,4 @@ def test_a_body_of_all_models_has_the_residues_of_all(tmp_path):
     (tmp_path / "two.pdb").write_text(text + "\nEND\n")
     points = np.array([[0.0, 0, 0], [60, 0, 0], [1, 0, 0]])
     charges = ResidueAttribute("charge")(BodyRef(tmp_path / "two.pdb"), points)
-    expected = [1, -1, 1]
-    assert_allclose(charges, expected, atol=1e-6)
+    assert_allclose(charges, [1, -1, 1], atol=1e-6)

@@ -12,7 +12,6 @@ from batches import two_bodies
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch
 from igps.data.collation import collate
 from igps.mesh.mesh import Mesh
-from igps.nn.histograms.pairs import PairHistogram
 from igps.signature.signature import Samples, Signature, SignatureConfig
 
 
@@ -69,27 +68,12 @@ def test_bodies_are_the_signatures_without_padding(signatures):
 
 def test_padding_is_marked(signatures):
     batch = collate(signatures)
-    found = batch.interior.mask.sum(dim=1).tolist()
-    assert found == [12, 7, 15]
-    found = torch.isfinite(batch.eigenvalues).sum(dim=1).tolist()
-    assert found == [5, 8, 3]
+    assert batch.interior.mask.sum(dim=1).tolist() == [12, 7, 15]
+    assert torch.isfinite(batch.eigenvalues).sum(dim=1).tolist() == [5, 8, 3]
     assert (batch.eigenvalues[~torch.isfinite(batch.eigenvalues)] > 0).all()
     for part in (batch.interior, batch.surface):
         for values in (part.points, part.eigenfunctions, *part.attributes.values()):
             assert (values[~part.mask] == 0).all()
-
-
-def test_collate_pads_without_changing_any_description(signatures):
-    batch = collate(signatures)
-    for kind in ("interior", "surface"):
-        histogram = PairHistogram(samples=kind)
-        together = histogram(batch)
-        alone = torch.cat([histogram(collate([signature])) for signature in signatures])
-        assert together.shape == (3, 10, 64)
-        assert_close(together, alone, atol=1e-7, rtol=0)
-        found = together.sum(dim=(1, 2))
-        expected = torch.ones(3)
-        assert_close(found, expected)
 
 
 def test_labels_and_names(signatures):
@@ -145,8 +129,7 @@ def test_points_are_centred_before_they_lose_digits():
         atol=1e-6,
         rtol=0,
     )
-    found = batch.interior.points.mean(dim=1)
-    np.testing.assert_allclose(found, 0, atol=1e-6)
+    np.testing.assert_allclose(batch.interior.points.mean(dim=1), 0, atol=1e-6)
 
 
 def test_nothing_and_unlike_attributes_are_refused(signatures):
@@ -167,8 +150,7 @@ def of_samples(batch, i):
 def test_subset_takes_real_samples_each_once(signatures, seed):
     batch = collate(signatures).interior
     some = batch.subset(10, seed)
-    found = some.mask.sum(dim=1).tolist()
-    assert found == [10, 7, 10]
+    assert some.mask.sum(dim=1).tolist() == [10, 7, 10]
     for i, n in enumerate((10, 7, 10)):
         assert len(of_samples(some, i)) == n
         assert of_samples(some, i) <= of_samples(batch, i)
@@ -242,8 +224,7 @@ def test_one_shape_of_a_batch_is_a_body(signatures):
     numbers = (0, -1, np.int64(1), torch.tensor(2), np.array(0))
     assert [batch[i].id for i in numbers] == ["body 0", "body 2", "body 1", "body 2", "body 0"]
     assert_array_equal(batch[2].eigenvalues, signatures[2].eigenvalues)
-    found = [body.id for body in batch.bodies()]
-    assert found == list(batch.ids)
+    assert [body.id for body in batch.bodies()] == list(batch.ids)
     with pytest.raises(IndexError):
         batch[3]
     with pytest.raises(IndexError, match="mask: expected 3 entries"):
@@ -298,25 +279,6 @@ class Several(Dataset[Signature]):
 
     def __getitem__(self, index):
         return self.signatures[index]
-
-
-def test_workers_give_the_batches_of_this_process(signatures):
-    """Of like shapes, which are written as they are, and of others, which are padded in every dimension."""
-    (batch,) = DataLoader(Several(signatures), batch_size=3, num_workers=1, collate_fn=collate)
-    expected = collate(signatures)
-    assert equal(batch, expected)
-    assert torch.equal(batch.eigenvalues, expected.eigenvalues)
-    for one, other in ((batch.interior, expected.interior), (batch.surface, expected.surface)):
-        assert torch.equal(one.eigenfunctions, other.eigenfunctions)
-        assert torch.equal(one.mask, other.mask)
-    alike = [
-        signatures[0],
-        replace(signatures[0], interior=signatures[0].surface),
-    ]
-    (batch,) = DataLoader(Several(alike), batch_size=2, num_workers=1, collate_fn=collate)
-    assert equal(batch, collate(alike))
-    assert torch.equal(batch.interior.eigenfunctions, collate(alike).interior.eigenfunctions)
-    batch.interior.points.zero_()  # writable, as any batch is
 
 
 def test_a_batch_is_fixed(signatures):

@@ -197,8 +197,7 @@ def test_many_bodies_of_a_file_are_reported_some_at_a_time(tmp_path, reads):
     outcomes = compute(
         pipeline, find_bodies(tmp_path), range(65), n_workers=1, executor=None, limits=Limits()
     )
-    found = [next(outcomes)[0] for _ in range(64)]
-    assert found == list(range(64))
+    assert [next(outcomes)[0] for _ in range(64)] == list(range(64))
     assert len(reads) == 1
     assert [number for number, _ in outcomes] == [64]
     assert len(reads) == 2
@@ -221,8 +220,7 @@ def test_each_has_the_signature_of_its_own_surface(root, tmp_path, reads, how):
             dataset[i].signature.eigenvalues, expected.eigenvalues, rtol=1e-9
         )
         assert dataset.mesh(i).volume == pytest.approx(body.volume)
-    found = len({dataset.key(i) for i in range(4)})
-    assert found == 4
+    assert len({dataset.key(i) for i in range(4)}) == 4
     if how == "at once":
         assert reads == [f"{1 + i // 2}.obj" for i in range(4)]  # for the meshes alone
 

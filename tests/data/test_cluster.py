@@ -36,7 +36,7 @@ def free_port():
 
 
 class Cluster:
-    """A scheduler and three workers, each a process."""
+    """A scheduler and two workers, each a process."""
 
     def __init__(self, folder):
         self.address = f"tcp://127.0.0.1:{free_port()}"
@@ -49,7 +49,7 @@ class Cluster:
         }
         host, port = self.address.removeprefix("tcp://").split(":")
         self.scheduler = self._start("scheduler", "--host", host, "--port", port, "--no-dashboard")
-        self.workers = [self.start_worker() for _ in range(3)]
+        self.workers = [self.start_worker() for _ in range(2)]
 
     def start_worker(self):
         options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "300"]
@@ -76,7 +76,7 @@ def cluster(tmp_path_factory):
     one = Cluster(tmp_path_factory.mktemp("cluster"))
     try:
         with distributed.Client(one.address, timeout=300, set_as_default=False) as client:
-            client.wait_for_workers(3, timeout=300)
+            client.wait_for_workers(2, timeout=300)
         yield one
     finally:
         one.end()

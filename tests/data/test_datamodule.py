@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from bodies_on_disk import write_body
 
+from bodies_on_disk import write_body
 from igps.data.datamodule import Batches, SignatureDataModule
 from igps.data.splits import Parts
 from igps.mesh.errors import MeshError
@@ -37,9 +37,7 @@ def test_loaders_give_the_parts_and_balanced_batches(root, tmp_path):
     module.prepare_data()
     names = module.dataset.bodies.names
     (batch,) = module.train_dataloader()
-    found = sorted(batch.labels.tolist())
-    expected = [0, 0, 1, 1, 2, 2]
-    assert found == expected
+    assert sorted(batch.labels.tolist()) == [0, 0, 1, 1, 2, 2]
     assert set(batch.ids) <= {names[i] for i in module.split.train}
     for loader, part in (
         (module.val_dataloader(), module.split.validation),
@@ -73,18 +71,6 @@ def test_training_shapes_are_kept_in_memory_thinned(root, tmp_path, n_samples):
         assert len(list(module.train_dataloader())) == 1  # without the cache
         shutil.rmtree(root)
         assert len(list(module.train_dataloader())) == 1
-
-
-def test_workers_read_the_same_batches(root, tmp_path):
-    cache = tmp_path / "cache"
-    one = SignatureDataModule(root, FEW, config=CONFIG, cache_dir=cache, n_workers=1)
-    other = SignatureDataModule(root, FEW, config=CONFIG, cache_dir=cache, n_loading_workers=2)
-    one.prepare_data()
-    other.prepare_data()
-    (whole,) = one.test_dataloader()
-    (read,) = other.test_dataloader()
-    assert read.ids == whole.ids
-    assert torch.equal(read.interior.points, whole.interior.points)
 
 
 def test_batches_of_nothing_are_refused():

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies_on_disk import write_body
 
+from bodies_on_disk import write_body
 from igps.data import keys
 from igps.data.cache_hit import CacheHit
 from igps.data.pipeline import SignaturePipeline
@@ -67,9 +67,7 @@ def test_a_worker_gets_a_small_copy(pipeline, path):
     sent = pickle.dumps(pipeline)
     assert len(sent) < 2000
     assert pickle.loads(sent) == pipeline
-    found = pickle.loads(sent).key(BodyRef(path))
-    expected = pipeline.key(BodyRef(path))
-    assert found == expected
+    assert pickle.loads(sent).key(BodyRef(path)) == pipeline.key(BodyRef(path))
 
 
 def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(

@@ -45,8 +45,7 @@ def test_shares_leave_two_of_each_class_to_validate_and_to_test():
     split = split_seen(labels, 0.75, n_validation=0.25)
     parts = (split.train, split.validation, split.test)
     counts = [torch.bincount(labels[list(part)]).tolist() for part in parts]
-    expected = [[1, 4, 11], [2, 2, 4], [2, 2, 5]]
-    assert counts == expected
+    assert counts == [[1, 4, 11], [2, 2, 4], [2, 2, 5]]
     of_classes = split_unseen(labels, 0.5, n_validation=0.5)
     for part in (of_classes.train, of_classes.test):
         assert len(labels[list(part)].unique()) == 1

@@ -8,9 +8,9 @@ import trimesh
 
 from igps.data.transforms import FewerSamples
 from igps.mesh.mesh import Mesh
-from igps.signature.signature import SignatureConfig, compute_signature
+from igps.signature.signature import compute_signature
+from own_descriptors import CONFIG
 
-CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 FEW = FewerSamples(n_interior=9, n_surface=7)
 
 

@@ -25,8 +25,7 @@ def test_an_installed_descriptor_is_known_by_its_name(installed, blob):
     batch = igps.collate([igps.compute_signature(blob, config)])
     roundness = igps.descriptor("roundness")
     assert not roundness.training
-    expected = pytest.approx(blob.volume / blob.area**1.5)
-    assert roundness(batch).item() == expected
+    assert roundness(batch).item() == pytest.approx(blob.volume / blob.area**1.5)
 
 
 def test_a_wrong_name_lists_installed_descriptors_too(installed):

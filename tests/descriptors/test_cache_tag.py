@@ -29,8 +29,7 @@ def words():
 
 
 def test_every_descriptor_has_words_of_its_own():
-    found = len({cache_tag(descriptor(name)) for name in NAMES} - {None})
-    assert found == len(NAMES)
+    assert len({cache_tag(descriptor(name)) for name in NAMES} - {None}) == len(NAMES)
     assert words() == words()
 
 

@@ -38,14 +38,3 @@ def test_histograms_are_those_of_the_layout(signature, samples):
             atol=2e-6,
         )
     assert (expected > 0).any(axis=1).sum() >= 3, "several classes are seen"
-
-
-def test_the_paper_takes_250_eigenpairs(signature):
-    for name in ("interior", "gps"):
-        found = igps.descriptor(name)
-        assert found.requirements.n_eigenpairs == 250
-        with pytest.raises(
-            ValueError,
-            match="n_eigenpairs: this descriptor needs signatures of at least 250, got 80",
-        ):
-            found(igps.collate([signature]))

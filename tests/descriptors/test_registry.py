@@ -98,12 +98,8 @@ def test_own_class_function_and_object_by_import_path(own, blob):
     found = made["Roundness"](batch).item()
     expected = pytest.approx(blob.volume / blob.area**1.5)
     assert found == expected
-    found = made["coarse"](batch)
-    expected = changed(D2(), n_bins=8)(batch)
-    torch.testing.assert_close(found, expected)
-    found = made["ready"](batch)
-    expected = changed(D2(), n_bins=16)(batch)
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(made["coarse"](batch), changed(D2(), n_bins=8)(batch))
+    torch.testing.assert_close(made["ready"](batch), changed(D2(), n_bins=16)(batch))
     assert igps.descriptor(f"{own}:ready") is made["ready"]
 
 

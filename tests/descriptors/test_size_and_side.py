@@ -96,9 +96,7 @@ def test_short_vectors_keep_the_numbers_of_size_and_side(signatures):
     vectors = descriptor(collate(list(signatures.values())))
     short = descriptor.shorten(vectors)
     assert short.shape[1] == 256 + 55
-    found = short[:, -55:]
-    expected = vectors[:, -55:]
-    assert_close(found, expected)
+    assert_close(short[:, -55:], vectors[:, -55:])
     with pytest.raises(ValueError, match="shorten: expected a descriptor of vectors"):
         igps.descriptor("rich+size").shorten(vectors)
 
@@ -410,6 +408,5 @@ def test_coordinates_keep_size_beside_those_of_the_descriptor(signatures):
     descriptions = sized(collate([signatures["body"], signatures["larger"]]))
     rows = sized.coordinates(descriptions)
     form = igps.descriptor("interior")(collate([signatures["body"]])).flatten()
-    found = rows[0, :-2]
-    assert_close(found, form.sqrt())
+    assert_close(rows[0, :-2], form.sqrt())
     assert rows[:, -2:].equal(descriptions[:, -2:])

@@ -194,7 +194,7 @@ def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp
     images = {"ct": ImageAttribute("ct/{file}.nii.gz", tmp_path / "root")}
     found = {}
     labels = [path.parent.name for path in files]
-    for name in ("interior", "interior+ct"):
+    for name in ("shape_dna", "shape_dna+ct"):
         chosen = igps.descriptor(name)
         dataset = SignatureDataset(
             files, cache_dir=tmp_path / "cache", descriptor=chosen, attributes=images
@@ -203,8 +203,8 @@ def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp
         described = describe(dataset, chosen)
         distances = chosen.distances(described, described)
         found[name] = retrieval_scores(distances, labels).mean()["nn"]
-    assert found["interior+ct"] >= 0.95
-    assert found["interior"] < 0.6
+    assert found["shape_dna+ct"] >= 0.95
+    assert found["shape_dna"] < 0.6
 
 
 def test_an_attribute_adds_its_histograms_with_its_weight(bodies, tmp_path):
@@ -219,8 +219,7 @@ def test_an_attribute_adds_its_histograms_with_its_weight(bodies, tmp_path):
     described = describe(dataset, whole)
     form = describe(dataset, descriptor("pretrained"))
     inside = describe(dataset, whole.inside)
-    found = inside.sum(dim=1)
-    assert_allclose(found, 1, rtol=1e-5)
+    assert_allclose(inside.sum(dim=1), 1, rtol=1e-5)
     by_bins = inside.reshape(3, 36, 32)  # pairs of eight classes
     levels = [by_bins, by_bins.reshape(3, 36, 8, 4).sum(dim=3), by_bins.sum(dim=2)]
     told = sum(chi_square(level.flatten(1), level.flatten(1)) for level in levels) / 3
@@ -229,8 +228,7 @@ def test_an_attribute_adds_its_histograms_with_its_weight(bodies, tmp_path):
     assert_allclose(found, expected, atol=1e-5)
     rows = whole.coordinates(described, within_class=True)
     kept = descriptor("pretrained").coordinates(form, within_class=True)
-    found = rows[:, : kept.shape[1]]
-    assert_allclose(found, kept, atol=1e-6)
+    assert_allclose(rows[:, : kept.shape[1]], kept, atol=1e-6)
     squares = rows[:, kept.shape[1] :].square()
     assert_allclose(squares, 0.5 * 0.083 / 0.017 * inside.flatten(1), atol=1e-5)
     assert igps.descriptor("pretrained+height=0.5+size").name == "pretrained+height=0.5+size"

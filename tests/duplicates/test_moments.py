@@ -61,38 +61,6 @@ def test_moments_of_a_box_are_its_closed_forms():
     )
 
 
-def test_moments_of_a_tetrahedron_are_those_of_its_points():
-    """By a product of Gauss's rules on the cube that is folded into it, exact up to the ninth degree."""
-    corners = np.array(
-        [
-            [0.0, 0, 0],
-            [2, 0.1, 0],
-            [0.3, 1, 0],
-            [0.2, 0.1, 0.7],
-        ]
-    )
-    body = trimesh.Trimesh(
-        corners,
-        [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
-    )
-    nodes, weights = np.polynomial.legendre.leggauss(6)
-    places = np.array(list(product((nodes + 1) / 2, repeat=3)))
-    r, s, t = places.T
-    shares = np.column_stack([r, s * (1 - r), t * (1 - r) * (1 - s)])
-    points = (shares @ (corners[1:] - corners[0])) / body.area**0.5
-    density = np.prod(list(product(weights / 2, repeat=3)), axis=1) * (1 - r) ** 2 * (1 - s)
-    density *= abs(np.linalg.det(corners[1:] - corners[0])) / body.area**1.5
-    points -= density @ points / density.sum()
-    square = np.square(points).sum(axis=1)
-    volume = density.sum()
-    second = np.linalg.eigvalsh((density[:, None] * points).T @ points)
-    third = np.linalg.norm((density * square) @ points) * volume**0.5 / second.sum() ** 1.5
-    even = np.log([volume, *second, density @ square**2])
-    found = of(body)[0]
-    expected = [*even, third]
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
 def test_a_motion_a_mirror_image_and_other_triangles_leave_nothing():
     body = lump((1.0, 0.7, 0.4), 0.1)
     turn = -Rotation.random(random_state=1).as_matrix()

@@ -1,4 +1,4 @@
-"""Examples to copy: descriptions, heads and spectra in PyTorch Geometric, DiffusionNet and pytorch-metric-learning."""
+"""Examples to copy: descriptions and heads in PyTorch Geometric and pytorch-metric-learning."""
 
 import sys
 
@@ -13,7 +13,6 @@ from igps.data.geometric import to_pyg
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.heads import ProjectionHead
-from igps.retrieval.metric import RetrievalScoresMetric
 from own_descriptors import small_interior, write_egg
 
 CONFIG = igps.SignatureConfig(n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=80)
@@ -61,79 +60,6 @@ def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(dataset):
     for trace, item in zip(traces.tolist(), dataset, strict=True):
         expected = np.exp(-0.05 * item.signature.eigenvalues * item.signature.area).sum()
         assert trace == pytest.approx(expected, rel=0.5)  # samples of 80 points
-
-
-class DiffusionBlock(nn.Module):
-    """A block of DiffusionNet (Sharp, Attaiki, Crane and Ovsjanikov 2022), without gradient features.
-
-    Each channel diffuses for a time of its own in the eigenbasis, and a perceptron mixes the channels of each point.
-    """
-
-    def __init__(self, n_channels):
-        super().__init__()
-        self.log_time = nn.Parameter(torch.full((n_channels,), -3.0))
-        first = nn.Linear(2 * n_channels, n_channels)
-        self.mix = nn.Sequential(
-            first,
-            nn.ReLU(),
-            nn.Linear(n_channels, n_channels),
-        )
-
-    def diffused(self, x, eigenvalues, eigenfunctions, mass):
-        """(P, D) values after a time, the constant eigenfunction included, which spectra leave out."""
-        mean = (mass @ x) / mass.sum()
-        spectral = eigenfunctions.T @ (mass[:, None] * (x - mean))
-        decay = (-eigenvalues[:, None] * self.log_time.exp()).exp()
-        return mean + eigenfunctions @ (decay * spectral)
-
-    def forward(self, x, eigenvalues, eigenfunctions, mass):
-        """(P, D) features of points to (P, D)."""
-        diffused = self.diffused(x, eigenvalues, eigenfunctions, mass)
-        return x + self.mix(torch.cat([x, diffused], dim=1))
-
-
-def test_a_diffusion_net_reads_the_spectrum_of_a_surface():
-    """Against implicit Euler steps of the heat equation, and it trains."""
-    import scipy.sparse.linalg
-    import trimesh
-
-    from igps.signature.laplacian import laplacian
-    from igps.spectra.eigensolver import eigenpairs
-
-    body = trimesh.creation.icosphere(subdivisions=3)
-    mesh = igps.Mesh(
-        body.vertices * [1, 1.3, 0.8],
-        body.faces,
-    )
-    stiffness, mass = laplacian(mesh)
-    spectrum = eigenpairs(stiffness, mass, 200)
-    eigenvalues = torch.tensor(spectrum.eigenvalues, dtype=torch.float32)
-    functions = torch.tensor(spectrum.eigenfunctions, dtype=torch.float32)
-    weights = torch.tensor(mass, dtype=torch.float32)
-    block = DiffusionBlock(3)
-    x = torch.from_numpy(np.array(mesh.vertices)).float()
-    found = block.diffused(x, eigenvalues, functions, weights).detach().numpy()
-    time = float(block.log_time[0].detach().exp())
-    n_steps = 400
-    implicit = scipy.sparse.diags(mass) + time / n_steps * stiffness
-    step = scipy.sparse.linalg.factorized(implicit.tocsc())
-    expected = np.array(mesh.vertices)
-    for _ in range(n_steps):
-        expected = np.column_stack([step(mass * column) for column in expected.T])
-    np.testing.assert_allclose(found, expected, atol=2e-3)
-
-    torch.manual_seed(0)
-    block = DiffusionBlock(3)
-    target = x.norm(dim=1, keepdim=True).expand(-1, 3)
-    optimizer = torch.optim.Adam(block.parameters(), lr=0.01)
-    losses = []
-    for _ in range(100):
-        loss = (block(x, eigenvalues, functions, weights) - target).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(float(loss.detach()))
-    assert losses[-1] < losses[0] / 3
 
 
 class AsTheirs(distances.BaseDistance):
@@ -232,18 +158,6 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     scores = igps.retrieval_scores(theirs(cells, cells), dataset.labels).mean()
     expected = igps.retrieval_scores(torch.cdist(cells, cells), dataset.labels).mean()
     assert scores == expected
-
-
-def test_retrieval_scores_accumulate_step_by_step(dataset):
-    descriptor = small_interior()
-    metric = RetrievalScoresMetric(descriptor.distances)
-    for batch in DataLoader(dataset, batch_size=3, collate_fn=igps.collate):
-        metric.update(descriptor(batch), batch.labels, batch.ids)
-    histograms = igps.describe(dataset, descriptor)
-    distances = descriptor.distances(histograms, histograms)
-    expected = igps.retrieval_scores(distances, dataset.labels).mean()
-    found = {name: float(value) for name, value in metric.compute().items()}
-    assert found == pytest.approx(expected)
 
 
 def test_missing_extras_are_named(monkeypatch, dataset):

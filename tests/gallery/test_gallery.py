@@ -10,6 +10,7 @@ import pytest
 import torch
 import trimesh
 
+from bodies_on_disk import write_body
 from commands import error_of, run
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
@@ -22,18 +23,9 @@ from igps.nn.description import describe
 from igps.retrieval import chi_square
 from igps.signature.signature import SignatureConfig
 from label_files import write_nifti
-from own_descriptors import SMALL, small_interior
+from own_descriptors import CONFIG, SMALL, small_interior
 
 INTERIOR = "own_descriptors:small_interior"
-CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
-
-
-def write_body(path, width, height):
-    """A stretched ball of 162 vertices."""
-    body = trimesh.creation.icosphere(subdivisions=2)
-    body.vertices *= [1.0, width, height]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    body.export(path)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from trimesh.creation import icosphere
 from conftest import FACES, TETRAHEDRON
 from igps.fields.meshes import ply
 from igps.mesh.errors import MeshError
-from igps.mesh.loading import load_bodies, load_mesh, read_surface
+from igps.mesh.loading import load_mesh, read_surface
 from igps.mesh.options import LoadOptions
 
 
@@ -89,27 +89,6 @@ def test_a_byte_order_mark_costs_no_vertex(tmp_path):
     assert (tmp_path / "mesh.obj").read_bytes()[3:5] == b"v "
     mesh = load_mesh(tmp_path / "mesh.obj")
     assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
-
-
-def test_quads_become_triangles(tmp_path):
-    corners = np.array(
-        [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)],
-        dtype=float,
-    )
-    quads = np.array(
-        [
-            [0, 2, 3, 1],
-            [4, 5, 7, 6],
-            [0, 1, 5, 4],
-            [1, 3, 7, 5],
-            [3, 2, 6, 7],
-            [2, 0, 4, 6],
-        ]
-    )
-    mesh = load_mesh(write_off(tmp_path / "cube.off", corners, quads))
-    assert mesh.faces.shape == (12, 3)
-    assert mesh.volume == pytest.approx(1)
-    assert mesh.area == pytest.approx(6)
 
 
 @pytest.mark.parametrize("start", [0, 3])
@@ -303,25 +282,6 @@ def test_texture_seams_do_not_split_vertices(tmp_path):
     assert_allclose(heights, np.array(TETRAHEDRON)[:, 2])
 
 
-@pytest.mark.parametrize("away", [0.0, 1e-9])
-def test_loose_triangles_need_and_get_welding(tmp_path, away):
-    """Corners that are in one place, or nearly so; of an STL file the former are one vertex already."""
-    surface = icosphere(subdivisions=2)
-    loose = np.asarray(surface.vertices)[surface.faces].reshape(-1, 3)
-    loose = loose + default_rng(0).uniform(-away, away, loose.shape)
-    path = write_off(
-        tmp_path / "mesh.off",
-        loose,
-        np.arange(len(loose)).reshape(-1, 3),
-    )
-    with pytest.raises(MeshError, match="boundary edges"):
-        load_mesh(path, LoadOptions("never"))
-    mesh = load_mesh(path)
-    assert len(mesh.vertices) == len(surface.vertices)
-    assert mesh.volume == pytest.approx(surface.volume, rel=1e-6)
-    assert any("welded" in note for note in mesh.notes)
-
-
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_each_fault_is_mended_at_any_scale(tmp_path, scale):
     surface = icosphere(subdivisions=2)
@@ -339,23 +299,6 @@ def test_each_fault_is_mended_at_any_scale(tmp_path, scale):
     said = " ".join(mesh.notes)
     for word in ("welded 1", "degenerate", "duplicate", "unreferenced", "orient"):
         assert word in said
-
-
-def test_pieces_that_are_no_body_together_are_bodies_each(tmp_path):
-    fine = icosphere(subdivisions=3)
-    large = trimesh.creation.box((5, 5, 5))
-    vertices = np.vstack([fine.vertices + 20, large.vertices])
-    faces = np.vstack(
-        [
-            fine.faces,
-            large.faces + len(fine.vertices),
-        ]
-    )
-    path = write_off(tmp_path / "two.off", vertices, faces)
-    with pytest.raises(MeshError, match="2 connected components"):
-        load_mesh(path, LoadOptions("never"))
-    pieces = load_bodies(path, LoadOptions("never", bodies="pieces"))
-    assert max(piece.volume for piece in pieces) == pytest.approx(125)
 
 
 def test_open_files_are_read_when_allowed(tmp_path):
@@ -400,25 +343,6 @@ def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(tmp_path, suffix, 
     assert any("watertight" in note for note in mesh.notes)
     with pytest.raises(MeshError, match=r"cloud.*no faces"):
         load_mesh(path, LoadOptions("never"))
-
-
-def test_a_body_is_left_as_it_is_bit_for_bit(tmp_path):
-    surface = icosphere(subdivisions=3)
-    path = write_off(tmp_path / "body.off", surface.vertices, surface.faces)
-    mended = load_mesh(path)
-    untouched = load_mesh(path, LoadOptions("never"))
-    assert_array_equal(mended.vertices, untouched.vertices)
-    assert_array_equal(mended.faces, untouched.faces)
-    assert mended.notes == ()
-
-
-def test_too_few_vertices_for_the_eigenpairs_are_made_more(tmp_path):
-    box = trimesh.creation.box()
-    path = write_off(tmp_path / "box.off", box.vertices, box.faces)
-    mesh = load_mesh(path, least_vertices=100)
-    assert len(mesh.vertices) >= 100
-    assert mesh.volume == pytest.approx(1)
-    assert mesh.area == pytest.approx(6)
 
 
 def test_a_format_without_its_module_says_which_extra_has_it(tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from tests.mesh.damages import DAMAGES, halves, holes
 from trimesh.creation import icosphere
 
+from conftest import tube
 from igps.mesh.errors import MeshError
 from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh
@@ -218,72 +219,14 @@ def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertig
 
 def coil(turns, pitch, radius=0.2):
     """A tube around a helix of radius 1, with flat ends."""
-    n = round(90 * turns)
-    around = 16
-    turn = np.linspace(0, turns, n)[:, None]
-    angle = 2 * np.pi * turn
-    middles = np.hstack(
-        [
-            np.cos(angle),
-            np.sin(angle),
-            pitch * turn,
-        ]
-    )
-    along = np.hstack(
-        [
-            -np.sin(angle),
-            np.cos(angle),
-            np.full_like(turn, pitch / (2 * np.pi)),
-        ]
-    )
-    outward = np.hstack(
-        [
-            np.cos(angle),
-            np.sin(angle),
-            np.zeros_like(turn),
-        ]
-    )
-    upward = np.cross(
-        outward,
-        along / norm(along, axis=1, keepdims=True),
-    )
-    phase = 2 * np.pi * np.arange(around) / around
-    rings = np.cos(phase)[:, None] * outward[:, None] + np.sin(phase)[:, None] * upward[:, None]
-    vertices = np.vstack(
-        [
-            (middles[:, None] + radius * rings).reshape(-1, 3),
-            middles[[0, -1]],
-        ]
-    )
-    i, j = np.meshgrid(
-        np.arange(n - 1),
-        np.arange(around),
-        indexing="ij",
-    )
-    a = i * around + j
-    b = i * around + (j + 1) % around
-    c = a + around
-    d = b + around
-    upper = np.stack([a, b, d], axis=-1).reshape(-1, 3)
-    lower = np.stack([a, d, c], axis=-1).reshape(-1, 3)
-    ring = np.arange(around)
-    following = (np.arange(around) + 1) % around
-    last = (n - 1) * around
-    start = np.stack(
-        [following, ring, np.full(around, n * around)],
-        axis=1,
-    )
-    end = np.stack(
-        [last + ring, last + following, np.full(around, n * around + 1)],
-        axis=1,
-    )
-    return Mesh(vertices, np.vstack([upper, lower, start, end]))
-
-
-def test_a_cloud_is_a_surface(sphere):
-    mesh = mend(sphere.vertices, None)
-    assert mesh.volume == pytest.approx(sphere.volume, rel=0.03)
-    assert repair_steps(mesh.notes) == ("watertight",)
+    angle = 2 * np.pi * np.linspace(0, turns, round(90 * turns))[:, None]
+    outward = np.hstack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
+    middles = outward + [0, 0, pitch / (2 * np.pi)] * angle
+    along = np.hstack([-np.sin(angle), np.cos(angle), np.full_like(angle, pitch / (2 * np.pi))])
+    upward = np.cross(outward, along / norm(along, axis=1, keepdims=True))
+    phase = np.linspace(0, 2 * np.pi, 16, endpoint=False)[:, None]
+    rings = np.cos(phase) * outward[:, None] + np.sin(phase) * upward[:, None]
+    return tube(middles[:, None] + radius * rings, middles[[0, -1]])
 
 
 def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob):

@@ -1,11 +1,10 @@
 """Areas, normals, edges and components against trimesh and loops."""
 
 import numpy as np
-import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 
-from conftest import as_mesh, as_trimesh
+from conftest import as_trimesh
 from igps.mesh import surface
 
 
@@ -71,19 +70,6 @@ def test_edges(blob):
     expected = sorted({(min(side), max(side)) for side in sides})
     assert edges.tolist() == [list(edge) for edge in expected]
     assert_array_equal(edges[edge_of], np.sort(sides, axis=1))
-
-
-@pytest.mark.parametrize("n_handles", [0, 1, 2, 3])
-def test_genus_counts_handles(n_handles):
-    """A slab of cubes with holes through it; the surface of voxels that share faces alone is a manifold."""
-    cells = np.ones(
-        (2 * n_handles + 1, 3, 1),
-        dtype=bool,
-    )
-    cells[1::2, 1] = False
-    voxels = trimesh.voxel.ops.matrix_to_marching_cubes(cells)
-    mesh = as_mesh(voxels)
-    assert mesh.genus == n_handles
 
 
 def test_parts_of_faces_and_their_areas():

@@ -80,11 +80,6 @@ def test_describe_is_the_descriptor_of_each_batch(dataset, batch_size, n_workers
     assert failures == []
 
 
-def test_a_name_in_place_of_a_descriptor_is_told(dataset):
-    with pytest.raises(TypeError, match=r"got 'rich'. Give igps.descriptor\('rich'\)"):
-        describe(dataset, "rich")
-
-
 def test_meshes_come_to_descriptors_that_need_them(dataset):
     expected = [
         [

@@ -41,23 +41,6 @@ def test_default_is_the_commute_time(spectrum):
 
 
 @pytest.mark.parametrize("is_learned", [False, True])
-def test_does_not_change_with_scale(spectrum, is_learned):
-    functions, values = spectrum
-    module = learned() if is_learned else SpectralEmbedding()
-    scale = 7.0
-    scaled = module(
-        functions / scale,
-        values / scale**2,
-        torch.tensor(
-            AREA * scale**2,
-            dtype=torch.float64,
-        ),
-    )
-    expected = module(functions, values, torch.tensor(AREA, dtype=torch.float64))
-    torch.testing.assert_close(scaled, expected, rtol=1e-9, atol=0)
-
-
-@pytest.mark.parametrize("is_learned", [False, True])
 def test_padding_has_no_weight(spectrum, is_learned):
     functions, values = spectrum
     module = learned() if is_learned else SpectralEmbedding()
@@ -97,13 +80,6 @@ def test_keeps_the_first_eigenpairs(spectrum):
     )
     found = SpectralEmbedding(n_eigenpairs=99)(functions, values, area).shape
     assert found == (20, 12)
-
-
-def test_learned_filter_starts_at_the_fixed_one(spectrum):
-    area = torch.tensor(AREA)
-    start = SpectralEmbedding(n_knots=16)
-    plain = SpectralEmbedding()
-    assert torch.equal(start(*spectrum, area), plain(*spectrum, area))
 
 
 def test_learned_filter_interpolates_its_knots_in_log():

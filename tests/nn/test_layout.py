@@ -62,20 +62,6 @@ def test_only_what_is_named_is_learned(part):
     assert len(parameter) == {"classes": 4, "bins": 64, "filter": 12}[part]
 
 
-def test_a_learned_layout_is_saved(tmp_path):
-    learned = igps.descriptor("interior", learnable=True, n_training_samples=20)
-    with torch.no_grad():
-        for parameter in learned.parameters():
-            parameter.add_(0.3)
-    learned.save(tmp_path / "mine.safetensors")
-    loaded = igps.load(tmp_path / "mine.safetensors")
-    assert loaded.histograms[0].n_training_samples == 20
-    batch = two_bodies()
-    learned.requirements = loaded.requirements = type(loaded.requirements)()
-    assert torch.equal(loaded(batch), learned(batch))
-    assert not torch.equal(loaded(batch), igps.descriptor("interior").describe(batch))
-
-
 def test_names_of_axes_and_what_was_fitted_are_kept():
     axis = Attribute("depth", quantiles=3)
     axis.fit(torch.tensor([0.1, 0.2, 0.6, 0.9]))

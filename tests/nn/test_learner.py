@@ -3,7 +3,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from pytorch_lightning import Callback, Trainer, seed_everything
 from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_metric_learning.losses import TripletMarginLoss
@@ -13,7 +12,6 @@ from torch.utils.data import DataLoader
 from igps.data.collation import collate
 from igps.data.datamodule import Batches, SignatureDataModule
 from igps.data.splits import Parts
-from igps.learning.training import train
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor
@@ -395,58 +393,3 @@ def test_without_head_the_test_scores_are_the_plain_ones(shapes, tmp_path):
     )
     with pytest.raises(ValueError, match="expected a head to train"):
         trainer(1, tmp_path).fit(model, module)
-
-
-def test_a_repeated_shape_counts_once(shapes, tmp_path):
-    """As a distributed sampler repeats some to give every process the same number."""
-    module = data(shapes)
-    model = RetrievalLearner(bins(), BlendedDistance(), loss=torch.nn.Identity())
-    (once,) = trainer(1, tmp_path).test(model, module, verbose=False)
-    module.split = replace(
-        module.split,
-        test=(*module.split.test, *module.split.test[:2]),
-    )
-    (repeated,) = trainer(1, tmp_path).test(model, module, verbose=False)
-    assert repeated == once
-
-
-def test_the_configuration_trains_and_its_checkpoint_loads_without_running_code(shapes, tmp_path):
-    layout = tmp_path / "small.yaml"
-    layout.write_text("parts:\n  - axes: [potential, interior_distance]\n    eigenpairs: 20\n")
-    signature = {
-        "n_eigenpairs": 20,
-        "resolution": 12,
-        "min_samples": 0,
-        "n_surface_samples": 20,
-    }
-    values = {
-        "model": {"descriptor": {"init_args": {"which": str(layout)}}},
-        "data": {
-            "root": str(shapes / "meshes"),
-            "cache_dir": str(shapes / "cache"),
-            "parts": {"n_train": 4, "n_validation": 2},
-            "config": signature,
-            "n_workers": 1,
-        },
-        "trainer": {
-            "max_epochs": 4,
-            "accelerator": "cpu",
-            "enable_progress_bar": False,
-            "default_root_dir": str(tmp_path),
-        },
-    }
-    file = tmp_path / "values.yaml"
-    file.write_text(yaml.safe_dump(values))
-    train(file)
-    checkpoint = tmp_path / "checkpoints" / "last.ckpt"
-    state = torch.load(checkpoint, weights_only=True)["state_dict"]
-    assert state["descriptor.histograms.0.embedding.log_gain"].shape == (12,)
-    (stored,) = tmp_path.rglob("config.yaml")
-    configuration = yaml.safe_load(stored.read_text())
-    assert configuration["data"]["parts"]["seed"] == 0
-    assert configuration["model"]["descriptor"]["init_args"]["learnable"] is True
-    checkpoint.rename(tmp_path / "moved.ckpt")  # away from the files beside it
-    assert_same(RetrievalLearner.load_from_checkpoint(tmp_path / "moved.ckpt").state_dict(), state)
-    module = SignatureDataModule.load_from_checkpoint(tmp_path / "moved.ckpt", weights_only=True)
-    assert module.dataset.config.n_eigenpairs == 20
-    assert len(module.split.train) == 3 * 2

@@ -75,8 +75,7 @@ def test_agrees_with_another_library(distance, dtype, tolerance, n_queries, n_ga
     )
     assert result.shape == (n_queries, n_gallery)
     assert result.dtype == dtype
-    found = result.double().numpy()
-    assert_allclose(found, expected, rtol=0, atol=tolerance)
+    assert_allclose(result.double().numpy(), expected, rtol=0, atol=tolerance)
 
 
 @pytest.mark.usefixtures("either_device")
@@ -100,18 +99,14 @@ def test_near_vectors_keep_their_cosine_distance():
         dtype=torch.float32,
     )
     # 1 − cos in float32 would be 6 % off
-    found = cosine(a, b).item()
-    expected = pytest.approx(angle**2 / 2, rel=1e-4)
-    assert found == expected
+    assert cosine(a, b).item() == pytest.approx(angle**2 / 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
 def test_cosine_ignores_length_even_at_the_ends_of_the_dtype(scale):
     a = torch.tensor([[1.0, 1.0]])
     b = torch.tensor([[1.0, 0.0]])
-    found = cosine(scale * a, scale * b).item()
-    expected = pytest.approx(1 - 0.5**0.5, rel=1e-6)
-    assert found == expected
+    assert cosine(scale * a, scale * b).item() == pytest.approx(1 - 0.5**0.5, rel=1e-6)
 
 
 @pytest.mark.parametrize("distance", ALL)
@@ -271,8 +266,7 @@ def test_chi_square_has_second_derivatives_and_none_at_empty_cells():
         empty,
         create_graph=True,
     )
-    found = grad(first.sum(), empty)[0].tolist()
-    assert found == [[0, 0]]
+    assert grad(first.sum(), empty)[0].tolist() == [[0, 0]]
 
 
 @pytest.mark.parametrize("distance", ALL)
@@ -313,8 +307,7 @@ def test_chi_square_never_holds_all_triples_of_query_gallery_and_cell():
 @pytest.mark.usefixtures("either_device")
 @pytest.mark.parametrize("distance", ALL)
 def test_an_empty_set_of_queries_gives_an_empty_matrix(distance):
-    found = distance(torch.empty(0, 4), torch.ones(3, 4)).shape
-    assert found == (0, 3)
+    assert distance(torch.empty(0, 4), torch.ones(3, 4)).shape == (0, 3)
 
 
 @pytest.mark.parametrize(

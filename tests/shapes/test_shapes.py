@@ -84,8 +84,7 @@ def test_arrays_and_triangles_are_sane(all_shapes):
     for shape in all_shapes:
         assert shape.vertices.dtype == np.float64
         assert shape.faces.dtype == np.int64
-        found = len(np.unique(shape.vertices, axis=0))
-        assert found == len(shape.vertices)
+        assert len(np.unique(shape.vertices, axis=0)) == len(shape.vertices)
         assert 1800 <= len(shape.vertices) <= 4200, shape.name
         surface = surface_of(shape)
         assert surface.volume > 0.05, shape.name

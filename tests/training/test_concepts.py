@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg
 import trimesh
 from docs import concepts
-from docs.benchmarks.weld import TUBE_FACES, facing_vertices, weld
+from docs.benchmarks.weld import facing_vertices, weld
 from matplotlib.colors import to_hex
 from matplotlib.image import imread
 from numpy.testing import assert_allclose
@@ -20,10 +20,8 @@ from igps.data.dataset import SignatureDataset
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.signature.laplacian import laplacian
-from igps.signature.signature import SignatureConfig
 from igps.signature.voxels import interior_samples
-
-CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
+from own_descriptors import CONFIG
 
 
 @pytest.fixture
@@ -111,17 +109,7 @@ def test_pose_draws_the_histogram_of_every_mesh(root, tmp_path, drawn, capsys):
     assert others > 3 * within
 
 
-def test_pose_draws_all_classes_by_default_and_refuses_unknown_ones(root, tmp_path, drawn, capsys):
-    out = tmp_path / "pose.png"
-    concepts.pose(root, None, out, CONFIG, tmp_path / "cache")
-    # There is no distance within a class of one body.
-    assert re.search(r"^rod 1 - \d\.\d+$", capsys.readouterr().out, re.MULTILINE)
-    assert len(drawn[0].axes[0].get_lines()) == 6
-    with pytest.raises(ValueError, match=r"no class hat\. It has ball, egg, rod"):
-        concepts.pose(root, ["egg", "hat"], out, CONFIG, tmp_path / "cache")
-
-
-def test_topology_measures_the_change_of_the_same_pairs(open_ring, tmp_path, drawn, capsys):
+def test_topology_measures_the_change_of_the_same_pairs(open_ring, tmp_path, capsys):
     out = tmp_path / "topology.png"
     concepts.topology(open_ring, None, out, n_eigenpairs=30, resolution=16)
     printed = capsys.readouterr().out
@@ -150,30 +138,10 @@ def test_topology_measures_the_change_of_the_same_pairs(open_ring, tmp_path, dra
     found = [float(x) for x in rows[1][1].split(", ")]
     assert found == pytest.approx(eigenvalues, rel=1e-3)
 
-    left, middle, right = drawn[0].axes
-    heights = [patch.get_height() for patch in left.patches]
-    assert sum(heights) == pytest.approx(100)
-    assert left.get_yscale() == "log"
-    assert "(%)" in left.get_xlabel()
-    n_orange = n_drawn = 0
-    for part in right.collections:
-        red, _, blue, _ = part.get_facecolor()[0]
-        n_drawn += len(part.get_paths())
-        n_orange += len(part.get_paths()) * (red > 2 * blue)
-    assert n_orange == TUBE_FACES
-    assert n_drawn > 2 * TUBE_FACES
-    assert middle.get_title()
     assert imread(out).std() > 0.05
 
 
-def test_topology_welds_where_it_is_told(open_ring, tmp_path, capsys):
-    concepts.topology(open_ring, (3, 357), tmp_path / "t.png", n_eigenpairs=10)
-    assert "welded at vertices 3 and 357" in capsys.readouterr().out
-    with pytest.raises(ValueError, match="b: expected a vertex index from 0 to 361"):
-        concepts.topology(open_ring, (3, 400), tmp_path / "t.png", n_eigenpairs=10)
-
-
-def test_potential_is_least_in_the_middle(tmp_path, drawn):
+def test_potential_is_least_in_the_middle(tmp_path):
     body = trimesh.creation.icosphere(subdivisions=3)
     body.vertices = body.vertices * [0.7, 2, 1] + [5, 6, 7]
     path = tmp_path / "egg.off"
@@ -204,17 +172,10 @@ def test_potential_is_least_in_the_middle(tmp_path, drawn):
         embedding(mesh, places, 40),
         axis=1,
     )
-    expected = pytest.approx(exact[0], rel=0.01)
-    assert np.nanmin(found.values) == expected
+    assert np.nanmin(found.values) == pytest.approx(exact[0], rel=0.01)
     i = int(np.argmin(np.abs(x - centre[0])))
     j = int(np.argmin(np.abs(y - centre[1] - 1.5)))
-    expected = pytest.approx(exact[1], rel=0.03)
-    assert found.values[i, j] == expected
+    assert found.values[i, j] == pytest.approx(exact[1], rel=0.03)
 
     concepts.potential(path, tmp_path / "potential.png", n_eigenpairs=40)
-    panel, bar = drawn[0].axes
-    assert "potential" in bar.get_ylabel()
-    assert "unit" in panel.get_xlabel()
-    (star,) = [line for line in panel.get_lines() if line.get_marker() == "*"]
-    assert_allclose(star.get_xydata()[0], centre, atol=1e-6)
     assert imread(tmp_path / "potential.png").std() > 0.05

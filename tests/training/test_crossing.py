@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-import trimesh
 from training.shapes.crossing import crossing_faces
 
 
@@ -42,19 +41,3 @@ def test_all_crossings_are_found(seed):
     found = {(int(min(pair)), int(max(pair))) for pair in crossing_faces(vertices, faces)}
     assert found == tried_one_by_one(vertices, faces)
     assert found
-
-
-def test_two_balls():
-    ball = trimesh.creation.icosphere(2)
-    for gap, crossed in ((2.1, False), (1.5, True)):
-        both = trimesh.util.concatenate(
-            [
-                ball,
-                ball.copy().apply_translation([gap, 0.013, 0.007]),
-            ]
-        )
-        found = crossing_faces(
-            np.asarray(both.vertices),
-            np.asarray(both.faces),
-        )
-        assert bool(len(found)) == crossed

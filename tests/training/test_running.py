@@ -1,9 +1,7 @@
 """Training by a file of values: a curve, an early end, and going on after an interruption."""
 
 import csv
-import os
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import torch
 import yaml
 
 import igps
+from commands import run as command
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split
 from igps.learning.training import DEFAULTS, train
@@ -20,7 +19,6 @@ from igps.nn.learner import RetrievalLearner
 from igps.retrieval import chi_square, retrieval_scores
 from igps.shapes import ArticulatedShapes
 
-PROJECT = Path(__file__).parents[2]
 SMALL = {"n_eigenpairs": 250, "resolution": 15, "min_samples": 0}
 COLUMNS = ("ft", "nn", "dcg", "st", "adr", "map")
 
@@ -69,22 +67,13 @@ def checkpoint(out, name="last"):
     return torch.load(out / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
-def test_an_interrupted_run_that_is_resumed_ends_as_one_that_ran_through(
-    root, tmp_path, monkeypatch
-):
+def test_an_interrupted_run_that_is_resumed_ends_as_one_that_ran_through(root, tmp_path):
     run(settings(root, tmp_path / "whole"))
-    step = RetrievalLearner.training_step
-
-    def interrupted(self, batch, batch_index):
-        if self.trainer.current_epoch == 2 and batch_index == 1:
-            raise RuntimeError("the power fails")
-        return step(self, batch, batch_index)
-
     broken = settings(root, tmp_path / "broken")
-    with monkeypatch.context() as patch:
-        patch.setattr(RetrievalLearner, "training_step", interrupted)
-        with pytest.raises(RuntimeError, match="the power fails"):
-            run(broken)
+    failing = settings(root, tmp_path / "broken")
+    failing["trainer"]["callbacks"].append({"class_path": "own_callback.PowerFailure"})
+    with pytest.raises(RuntimeError, match="the power fails"):
+        run(failing)
     assert len(curve(tmp_path / "broken")) == 2
     with pytest.raises(FileExistsError, match="Give --resume"):
         run(broken)
@@ -138,15 +127,22 @@ def test_an_unknown_value_and_a_missing_file_are_named(root: Path, tmp_path: Pat
         train(tmp_path / "none.yaml")
 
 
-def test_a_checkpoint_is_scored_as_by_the_librarys_parts(root, tmp_path):
-    """From a folder to a checkpoint to its scores, in processes of their own."""
+def evaluate(monkeypatch, path):
+    """What `python -m training.evaluate` does."""
+    monkeypatch.setattr(sys, "argv", ["evaluate", str(path)])
+    runpy.run_module("training.evaluate", run_name="__main__")
+
+
+def test_a_checkpoint_is_scored_as_by_the_librarys_parts(root, tmp_path, monkeypatch, capsys):
+    """From a folder to a checkpoint to its scores."""
     out = tmp_path / "out"
     file = tmp_path / "values.yaml"
     file.write_text(yaml.safe_dump(settings(root, out)))
-    run_apart("igps", "train", file)
+    command("train", file)
     path = out / "checkpoints" / "last.ckpt"
-    table = run_apart("training.evaluate", path)
-    header, *lines = table.splitlines()
+    capsys.readouterr()
+    evaluate(monkeypatch, path)
+    header, *lines = capsys.readouterr().out.splitlines()
     assert header.split() == ["FT", "NN", "DCG", "ST", "ADR", "mAP"]
     printed = {line.split()[0]: [float(x) for x in line.split()[1:]] for line in lines}
     assert list(printed) == ["plain", "learned", "whitened", "kernel"]
@@ -184,15 +180,6 @@ def test_a_checkpoint_is_scored_as_by_the_librarys_parts(root, tmp_path):
         assert printed[name] == pytest.approx(expected, abs=0.06), name
 
 
-def run_apart(module, *arguments):
-    """What a module prints in a process of its own."""
-    command = [sys.executable, "-m", module, *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": f"{PROJECT / 'src'}{os.pathsep}{PROJECT}"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -204,8 +191,7 @@ def test_a_file_that_is_no_checkpoint_is_named_in_one_sentence(
     name, message, tmp_path, here, monkeypatch, capsys
 ):
     (tmp_path / "text.ckpt").write_text("words")
-    monkeypatch.setattr(sys, "argv", ["evaluate", name])
     with pytest.raises(SystemExit, match="1"):
-        runpy.run_module("training.evaluate", run_name="__main__")
+        evaluate(monkeypatch, name)
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == f"igps: {message}" or last.endswith(message)

@@ -6,11 +6,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from training.shapes.kinds import KINDS
 from training.shapes.rigging import bones_at_rest, limb_rig
-from training.shapes.rods import Binding, Rig, Rod, bend, bind, rod_motions
+from training.shapes.rods import Binding, Rig, Rod, bend, rod_motions
 from training.shapes.templates import TEMPLATES
-
-from igps.shapes.skeleton import Part, Skeleton, limb
-from igps.shapes.solids import Blob
 
 
 def cylinder(length, radius):
@@ -120,54 +117,6 @@ def test_a_hinge_keeps_lengths_near_both_bones():
     joint = np.array([0, 0, 1.5])
     expected = Rotation.from_rotvec([1.2, 0, 0]).apply(bar.vertices[top] - joint) + joint
     assert_allclose(bent[top], expected, atol=1e-12)
-
-
-def test_weights_are_shares_and_follow_the_nearest_rod():
-    arm = limb(
-        "arm",
-        [0.6, 0.6],
-        [0.15, 0.13, 0.12],
-        [(20, 10), (25, 0)],
-    )
-    hub = Blob((0.4, 0.4, 0.4))
-    arms = tuple(
-        arm.joined(
-            (0, 0, 0.3 * side),
-            (0, 0, side),
-        )
-        for side in (-1, 1)
-    )
-    skeleton = Skeleton(Part(hub, children=arms))
-    bones = bones_at_rest(skeleton, {})
-    rig = limb_rig(bones)
-    assert [rod.parent for rod in rig.rods] == [-1, 0, 0]  # the hub, and two arms of two bones each
-    assert rig.rod_of_solid.tolist() == [0, 1, 1, 2, 2]
-    bar = cylinder(1.6, 0.13)
-    ball = trimesh.creation.icosphere(4, 0.4).apply_translation([2, 0, 0])
-    both = trimesh.util.concatenate([bar, ball])
-    solids = [bone.placed for bone in bones]
-    binding = bind(
-        np.asarray(both.vertices),
-        np.asarray(both.faces),
-        rig,
-        solids,
-    )
-    assert_allclose(binding.weights.sum(axis=1), 1.0)
-    assert (binding.weights >= 0.0).all()
-    z = bar.vertices[:, 2]
-    weights = binding.weights[: len(z)]
-    assert (weights[z > 0.75, 2] > 0.99).all()
-    assert (weights[z < 0.1, 0] > 0.9).all()
-    assert (weights[:, 1] == 0.0).all()  # the other arm is nowhere near
-    # Along the arm its arc length, which begins at its root 0.3 from the middle.
-    middle = (z > 0.8) & (z < 1.3)
-    found = binding.arc_lengths[: len(z)][middle, 2]
-    expected = z[middle] - 0.3
-    assert_allclose(found, expected, atol=0.02)
-    # From the hub to the arm the weights go over without a step.
-    levels = np.unique(z.round(9))
-    mean = np.array([weights[np.isclose(z, level), 2].mean() for level in levels])
-    assert np.abs(np.diff(mean)).max() < 0.15
 
 
 def test_trunks_bend_and_frames_do_not():

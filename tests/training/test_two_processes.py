@@ -45,7 +45,7 @@ def module(tmp_path_factory):
 def trainer(n_processes, root):
     # Processes of their own for two: those of the tests have no script that could be started again.
     return Trainer(
-        max_epochs=2,
+        max_epochs=1,
         accelerator="cpu",
         devices=n_processes,
         strategy="ddp_spawn" if n_processes > 1 else "auto",

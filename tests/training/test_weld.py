@@ -1,7 +1,5 @@
 """Welds: the tube adds one handle, and the gap it bridges is the best of all pairs of vertices."""
 
-import itertools
-
 import numpy as np
 import pytest
 import trimesh
@@ -58,32 +56,13 @@ def test_weld_adds_a_handle_and_nothing_else():
     assert {tuple(face) for face in kept} < old
     assert len(removed) == 2
     assert all(a in face or b in face for face in removed)
-    found = set(tube.ravel().tolist())
-    expected = {vertex for face in removed for vertex in face}
-    assert found == expected
+    assert set(tube.ravel().tolist()) == {vertex for face in removed for vertex in face}
     # The tube is a solid bridge over the gap: about half of the two triangles' area times the gap.
     assert 0 < welded.volume - mesh.volume < 0.05 * mesh.volume
     assert f"vertices {a} and {b}" in welded.notes[-1]
     # The way from one end to the other is now as long as the gap, no more once around the ring.
     assert paths(mesh)[a, b] > 5
     assert paths(welded)[a, b] < 5 * norm(mesh.vertices[a] - mesh.vertices[b])
-
-
-def test_weld_takes_the_shortest_tube():
-    mesh = horseshoe(0.15)
-    a = 3
-    b = len(mesh.vertices) - 10
-    at = [[face for face in mesh.faces.tolist() if vertex in face] for vertex in (a, b)]
-    lengths = []
-    for one, (p, q, r) in itertools.product(*at):
-        for turned in ((r, q, p), (q, p, r), (p, r, q)):
-            sides = mesh.vertices[one] - mesh.vertices[list(turned)]
-            lengths.append(norm(sides, axis=1).sum())
-    tube = weld(mesh, a, b).faces[-TUBE_FACES:]
-    ends = mesh.vertices[tube[1::2][:, [0, 2]]]
-    found = norm(ends[:, 0] - ends[:, 1], axis=1).sum()
-    expected = pytest.approx(min(lengths))
-    assert found == expected
 
 
 def test_weld_refuses_what_cannot_be_welded(sphere):
@@ -129,19 +108,9 @@ def test_facing_vertices_are_the_best_of_all_pairs(make, largest_gap, least_path
         allowed &= along >= least_path * mesh.diagonal
         value = along / gap
     assert allowed[a, b]
-    expected = pytest.approx(value[allowed].max())
-    assert value[a, b] == expected
+    assert value[a, b] == pytest.approx(value[allowed].max())
 
 
 def test_convex_body_has_no_gap(sphere):
     with pytest.raises(MeshError, match="no two places face each other"):
         weld_gap(sphere)
-
-
-def test_homer_is_welded_at_the_feet(homer):
-    pair = homer.vertices[list(facing_vertices(homer))]
-    height = (pair[:, 1] - homer.vertices[:, 1].min()) / np.ptp(homer.vertices[:, 1])
-    assert (height < 0.1).all()
-    found = norm(pair[0] - pair[1])
-    expected = pytest.approx(0.0096, abs=5e-4)
-    assert found == expected

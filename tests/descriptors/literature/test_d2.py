@@ -22,13 +22,10 @@ def test_d2_of_a_sphere_has_the_density_of_its_chords(round_body):
     reach = 2 / np.sqrt(4 * np.pi)
     histogram = changed(D2(), n_bins=n_bins, reach=reach).describe_body(round_body)
     edges = np.linspace(0, 1, n_bins + 1)
-    found = np.cumsum(histogram)
-    expected = edges[1:] ** 2
-    np.testing.assert_allclose(found, expected, atol=0.01)
+    np.testing.assert_allclose(np.cumsum(histogram), edges[1:] ** 2, atol=0.01)
     # In the range that all shapes share, the sphere ends where its diameter does.
     wide = D2().describe_body(round_body)
-    found = wide[int(64 * reach / 2.0) + 1 :].sum()
-    assert found == 0
+    assert wide[int(64 * reach / 2.0) + 1 :].sum() == 0
     assert wide.sum() == pytest.approx(1, abs=1e-6)
 
 
@@ -43,16 +40,13 @@ def test_d2_counts_each_pair_once_and_what_lies_beyond_in_the_last_bin():
     )
     histogram = changed(D2(), n_bins=4, reach=2.0).describe_body(of_points(points, area=4.0))
     # Lengths over √4: 0.5, 2.5, 25, 2, 24.5, 22.5.
-    expected = [0, 1 / 6, 0, 5 / 6]
-    np.testing.assert_allclose(histogram, expected, atol=1e-6)
+    np.testing.assert_allclose(histogram, [0, 1 / 6, 0, 5 / 6], atol=1e-6)
 
 
 def test_d2_distance_is_half_the_l1_norm():
     one = torch.tensor([[0.5, 0.5, 0.0]])
     two = torch.tensor([[0.0, 0.25, 0.75], [0.5, 0.5, 0.0]])
-    found = D2().distances(one, two)
-    expected = torch.tensor([[0.75, 0.0]])
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(D2().distances(one, two), torch.tensor([[0.75, 0.0]]))
 
 
 def test_a_single_sample_is_refused():

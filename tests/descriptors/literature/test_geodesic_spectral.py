@@ -1,15 +1,12 @@
 import numpy as np
 import pytest
 import torch
-import trimesh
 from numpy.testing import assert_allclose
 from one_body import of_mesh
 from scipy.special import eval_legendre
 from shortest_paths import geodesic_distances
 
-from conftest import as_mesh
 from igps.descriptors.literature.geodesic_spectral import GeodesicSpectral, affinity_eigenvalues
-from igps.mesh.mesh import Mesh
 from own_descriptors import changed
 
 
@@ -40,8 +37,7 @@ def test_description_of_the_sphere(sphere):
     described = descriptor.describe_body(of_mesh(sphere))
     assert described.shape == (9,)
     assert described.dtype == np.float32
-    expected = np.sqrt(np.abs(sphere_eigenvalues(9)))
-    assert_allclose(described, expected, atol=0.02)
+    assert_allclose(described, np.sqrt(np.abs(sphere_eigenvalues(9))), atol=0.02)
 
 
 def test_eigenvalues_of_two_and_of_equidistant_points():
@@ -61,38 +57,6 @@ def test_trace_is_one(blob):
     assert (np.diff(described[:10]) <= 0).all()
 
 
-def _tube(angle):
-    """A thin capsule of length 6 along z, bent by an angle."""
-    cap = np.linspace(0, np.pi / 2, 6)
-    profile = np.concatenate(
-        [
-            np.stack(
-                [0.1 * np.sin(cap), -3 - 0.1 * np.cos(cap)],
-                axis=1,
-            ),
-            np.stack(
-                [np.full(60, 0.1), np.linspace(-3, 3, 62)[1:-1]],
-                axis=1,
-            ),
-            np.stack(
-                [0.1 * np.cos(cap), 3 + 0.1 * np.sin(cap)],
-                axis=1,
-            ),
-        ]
-    )
-    surface = trimesh.creation.revolve(profile, sections=12)
-    x, y, z = surface.vertices.T
-    if angle == 0:
-        return as_mesh(surface)
-    radius = 6 / angle
-    turn = z * angle / 6
-    bent = np.stack(
-        [(radius + x) * np.cos(turn), y, (radius + x) * np.sin(turn)],
-        axis=1,
-    )
-    return Mesh(bent, surface.faces)
-
-
 def test_distances_are_chi_square():
     a = np.array([[0.9, 0.3]], dtype=np.float32)
     b = np.array([[0.5, 0.1]], dtype=np.float32)
@@ -105,15 +69,3 @@ def test_distances_are_chi_square():
 def test_more_samples_than_vertices_are_refused(blob):
     with pytest.raises(ValueError, match="642"):
         changed(GeodesicSpectral(), n_samples=700).describe_body(of_mesh(blob))
-
-
-def test_the_numbers_of_vertices_do_not_matter(blob):
-    descriptor = changed(GeodesicSpectral(), max_vertices=400)
-    order = np.random.default_rng(3).permutation(len(blob.vertices))
-    renumbered = Mesh(
-        blob.vertices[order],
-        np.argsort(order)[blob.faces][::-1],
-    )
-    expected = descriptor.describe_body(of_mesh(blob))
-    found = descriptor.describe_body(of_mesh(renumbered))
-    assert_allclose(found, expected, rtol=1e-5)

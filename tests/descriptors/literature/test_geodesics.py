@@ -43,13 +43,10 @@ def test_farthest_points_are_greedy(blob):
     # The first is an end of a long path: a step from it to the farthest and one from there do not lead much farther.
     length = samples.distances[0].max()
     everywhere = geodesic_distances(blob, np.arange(len(blob.vertices)))
-    found = everywhere[samples.vertices[0]].max()
-    expected = pytest.approx(length, rel=1e-12)
-    assert found == expected
+    assert everywhere[samples.vertices[0]].max() == pytest.approx(length, rel=1e-12)
     assert length > 0.95 * everywhere.max()
     assert_array_equal(samples.mutual, samples.mutual.T)
-    expected = samples.distances[:, samples.vertices]
-    assert_allclose(samples.mutual, expected, rtol=1e-12)
+    assert_allclose(samples.mutual, samples.distances[:, samples.vertices], rtol=1e-12)
 
 
 def renumbered(mesh, seed):
@@ -71,9 +68,7 @@ def test_farthest_points_do_not_depend_on_numbers(blob):
     samples = farthest_points(blob, 60)
     for seed in range(3):
         mesh, new = renumbered(blob, seed)
-        found = farthest_points(mesh, 60).vertices
-        expected = new[samples.vertices]
-        assert_array_equal(found, expected)
+        assert_array_equal(farthest_points(mesh, 60).vertices, new[samples.vertices])
 
 
 def test_rounding_does_not_decide_between_equally_far_points():

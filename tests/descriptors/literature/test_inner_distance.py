@@ -126,16 +126,12 @@ def test_chain_of_single_cells_is_walked_along():
         [[0, 0, 0], [3, 0, 0], [7, 0, 0], [7, 5, 0], [7, 5, 1]],
         dtype=float,
     )
-    found = inner_distances(points, np.array([0]))[0]
-    expected = [0, 3, 7, 12, 13]
-    assert_allclose(found, expected)
+    assert_allclose(inner_distances(points, np.array([0]))[0], [0, 3, 7, 12, 13])
 
 
 def test_cell_is_found_where_no_two_samples_are_neighbours():
     points = np.array([[0, 0, 0], [2, 0, 0], [5, 0, 0]]) * 0.1 + 0.7
-    found = inner_distances(points, np.array([0]))[0]
-    expected = [0, 0.2, 0.5]
-    assert_allclose(found, expected)
+    assert_allclose(inner_distances(points, np.array([0]))[0], [0, 0.2, 0.5])
 
 
 @pytest.mark.parametrize(

@@ -70,8 +70,7 @@ def test_walls_lie_between_the_cells_where_the_surface_is():
             1,
             4000,
         )
-        expected = pytest.approx(3 * np.pi**2, rel=0.006)
-        assert first[0] == expected
+        assert first[0] == pytest.approx(3 * np.pi**2, rel=0.006)
 
 
 def test_description_is_the_spectrum(blob):
@@ -80,8 +79,7 @@ def test_description_is_the_spectrum(blob):
     )
     assert description.dtype == np.float32
     assert description.shape == (10,)
-    expected = volume_spectrum(blob, 10, 500)
-    np.testing.assert_allclose(description, expected, rtol=1e-6)
+    np.testing.assert_allclose(description, volume_spectrum(blob, 10, 500), rtol=1e-6)
 
 
 def test_distances_are_euclidean():

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 from torch.testing import assert_close
 
-from batches import alone, batch_of, embedded, scaled, two_bodies
+from batches import batch_of, embedded, two_bodies
 from igps.data.requirements import Requirements
 from igps.descriptors.pretrained.branch_histogram import BranchHistogram
 from igps.descriptors.pretrained.piece_histogram import PieceHistogram
@@ -144,38 +144,6 @@ def test_pieces_of_a_star_are_its_arms():
 
 
 @BOTH
-def test_padding_and_scale_change_nothing(make):
-    batch = two_bodies()
-    histogram = make(embedding=EMBEDDING)
-    found = histogram(batch)
-    assert found.shape == (2, *histogram.shape)
-    expected = torch.ones(2)
-    assert_close(found.flatten(1).sum(dim=1), expected)
-    for i in range(2):
-        assert_close(histogram(alone(batch, i))[0], found[i])
-    assert_close(
-        histogram(scaled(batch, 3.0)),
-        found,
-        atol=1e-5,
-        rtol=0,
-    )
-
-
-@BOTH
-def test_the_order_of_samples_changes_nothing(make):
-    batch = alone(two_bodies(), 0)
-    histogram = make(embedding=EMBEDDING)
-    order = torch.randperm(
-        40,
-        generator=torch.Generator().manual_seed(5),
-    )
-    surface = batch.surface
-    other = surface.map(lambda values: values[:, order])
-    found = histogram(replace(batch, surface=other))
-    assert_close(found, histogram(batch))
-
-
-@BOTH
 def test_a_subset_of_the_samples_is_told(make):
     batch = two_bodies()
     expected = make(embedding=EMBEDDING)(
@@ -184,8 +152,7 @@ def test_a_subset_of_the_samples_is_told(make):
             surface=batch.surface.subset(20, seed=0),
         )
     )
-    found = make(embedding=EMBEDDING, n_samples=20)(batch)
-    assert_close(found, expected)
+    assert_close(make(embedding=EMBEDDING, n_samples=20)(batch), expected)
     interior = make(embedding=EMBEDDING, samples="interior")(batch)
     expected = make(embedding=EMBEDDING)(replace(batch, surface=batch.interior))
     assert_close(interior, expected)

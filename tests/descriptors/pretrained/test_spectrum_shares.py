@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from batches import N_EIGENPAIRS, alone, scaled, two_bodies
+from batches import N_EIGENPAIRS, two_bodies
 from igps.data.requirements import Requirements
 from igps.descriptors.pretrained.spectrum_shares import SpectrumShares
 from igps.nn.descriptor import HistogramDescriptor
@@ -22,8 +22,7 @@ def test_shares_are_those_of_a_loop():
         # Of the ball of this volume
         radius = (3 * float(batch.volume[i]) / (4 * math.pi)) ** (1 / 3)
         shares = [float(batch.eigenvalues[i, k - 1]) * radius**2 / (2 * k) / 6 for k in range(1, 7)]
-        expected = torch.tensor([*shares, 1 - sum(shares)])
-        assert_close(found[i], expected)
+        assert_close(found[i], torch.tensor([*shares, 1 - sum(shares)]))
 
 
 def test_a_spectrum_that_follows_weyl_has_equal_shares():
@@ -55,17 +54,6 @@ def test_the_spectrum_of_a_surface_with_many_handles_is_cut_off():
         atol=1e-6,
         rtol=0,
     )
-
-
-def test_padding_and_scale_change_nothing():
-    batch = two_bodies()
-    histogram = SpectrumShares(min(N_EIGENPAIRS))
-    found = histogram(batch)
-    expected = torch.ones(2)
-    assert_close(found.sum(dim=1), expected)
-    for i in range(2):
-        assert_close(histogram(alone(batch, i))[0], found[i])
-    assert_close(histogram(scaled(batch, 3.0)), found)
 
 
 def test_needs_and_what_is_refused():

@@ -17,6 +17,7 @@ from igps.mesh.loading import each_body, load_mesh
 from igps.mesh.options import LoadOptions
 
 BOX = trimesh.creation.box((2, 3, 4))
+FACES = BOX.faces.tolist()
 VOLUME = 24.0
 
 
@@ -69,31 +70,6 @@ def test_off_with_its_word_in_any_case_or_without(word, tmp_path):
 # PLY with texture coordinates
 
 
-def polygons():
-    """The box as ten triangles and a quadrilateral."""
-    faces = [list(map(int, face)) for face in BOX.faces]
-    beside = next(
-        k
-        for k in range(1, 12)
-        if np.allclose(
-            BOX.face_normals[k],
-            BOX.face_normals[0],
-        )
-    )
-    first = faces[0]
-    second = faces[beside]
-    opposite = next(corner for corner in second if corner not in first)
-    at = next(k for k in range(3) if first[k] not in second)
-    quad = [
-        first[at],
-        first[(at + 1) % 3],
-        opposite,
-        first[(at + 2) % 3],
-    ]
-    others = [face for k, face in enumerate(faces) if k not in (0, beside)]
-    return [quad, *others]
-
-
 def ply(order, lists_first):
     kind = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
     of_faces = ["property list uchar int vertex_indices", "property list uchar float texcoord"]
@@ -101,12 +77,12 @@ def ply(order, lists_first):
         of_faces.reverse()
     header = ["ply", f"format {kind} 1.0", f"element vertex {len(BOX.vertices)}"]
     header += [f"property float {axis}" for axis in "xyz"]
-    header += [f"element face {len(polygons())}", *of_faces, "end_header\n"]
+    header += [f"element face {len(FACES)}", *of_faces, "end_header\n"]
     body = b""
     for vertex in BOX.vertices:
         text = " ".join(map(str, vertex)) + "\n"
         body += struct.pack(f"{order}3f", *vertex) if order else text.encode()
-    for polygon in polygons():
+    for polygon in FACES:
         uv = [0.5] * (2 * len(polygon))
         corners = struct.pack(f"{order or '<'}B{len(polygon)}i", len(polygon), *polygon)
         texture = struct.pack(f"{order or '<'}B{len(uv)}f", len(uv), *uv)
@@ -374,8 +350,7 @@ def write_ball(path, n_missing):
 
 def test_a_few_vertices_without_coordinates_are_dropped(tmp_path):
     mesh = load_mesh(write_ball(tmp_path / "ball.off", 2))
-    expected = pytest.approx(4 / 3 * np.pi, rel=5e-3)
-    assert mesh.volume == expected
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi, rel=5e-3)
     assert any(note.startswith("dropped 2 vertices without coordinates") for note in mesh.notes)
 
 
@@ -428,8 +403,7 @@ def test_units_of_nrrd_as_they_are_written(unit, millimetres, tmp_path):
     (tmp_path / "block.nrrd").write_bytes(header.encode() + block().tobytes())
     mesh = load_mesh(tmp_path / "block.nrrd")
     assert mesh.unit == "mm"
-    expected = pytest.approx(64 * (2 * millimetres) ** 3, rel=0.01)
-    assert mesh.volume == expected
+    assert mesh.volume == pytest.approx(64 * (2 * millimetres) ** 3, rel=0.01)
 
 
 @pytest.mark.parametrize("extra", ["", "axis mins: 0 0 0\naxis maxs: 16 16 16\n"])

@@ -138,7 +138,6 @@ def gltf(uri):
     )
 
 
-@pytest.mark.parametrize("suffix", ["gltf", "glb"])
 @pytest.mark.parametrize(
     "how",
     [
@@ -147,7 +146,7 @@ def gltf(uri):
         {},
     ],
 )
-def test_coordinates_that_would_be_taken_for_others_are_refused(how, suffix, tmp_path):
+def test_coordinates_that_would_be_taken_for_others_are_refused(how, tmp_path):
     """Of a scene whose places are whole numbers, as tools that compress make them."""
     scene = json.loads(gltf("numbers.bin"))
     scene["accessors"][0] |= {"componentType": 5122, **how}
@@ -162,21 +161,13 @@ def test_coordinates_that_would_be_taken_for_others_are_refused(how, suffix, tmp
     )
     numbers = rows.tobytes().ljust(48, b"\0") + faces.tobytes()
     (tmp_path / "numbers.bin").write_bytes(numbers)
-    if suffix == "glb":
-        del scene["buffers"][0]["uri"]
-    text = json.dumps(scene).encode()
-    if suffix == "glb":
-        text += b" " * (-len(text) % 4)
-        chunks = len(text).to_bytes(4, "little") + b"JSON" + text
-        chunks += len(numbers).to_bytes(4, "little") + b"BIN\0" + numbers
-        text = b"glTF\2\0\0\0" + (12 + len(chunks)).to_bytes(4, "little") + chunks
-    (tmp_path / f"a.{suffix}").write_bytes(text)
+    (tmp_path / "a.gltf").write_text(json.dumps(scene))
     if how:
-        words = rf"a\.{suffix}: not readable as glTF.*sparse or normalized"
+        words = r"a\.gltf: not readable as glTF.*sparse or normalized"
         with pytest.raises(MeshError, match=words):
-            load_mesh(tmp_path / f"a.{suffix}")
+            load_mesh(tmp_path / "a.gltf")
     else:
-        assert load_mesh(tmp_path / f"a.{suffix}").volume == pytest.approx(9**3 / 6)
+        assert load_mesh(tmp_path / "a.gltf").volume == pytest.approx(9**3 / 6)
 
 
 @pytest.mark.parametrize(

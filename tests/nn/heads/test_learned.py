@@ -142,20 +142,6 @@ def test_without_head_it_is_the_paper(histograms):
     )
 
 
-def test_state_round_trips_into_one_without_sizes(histograms):
-    torch.manual_seed(2)
-    one = BlendedDistance(ProjectionHead().eval())
-    one.head.fit(histograms, torch.zeros(12))
-    one.calibrate(histograms)
-    state = {name: value.clone() for name, value in one.state_dict().items()}
-    other_size = BlendedDistance(ProjectionHead().fit(histograms[:, :1], torch.zeros(12)).eval())
-    for two in (BlendedDistance(ProjectionHead().eval()), other_size):
-        two.load_state_dict(state)
-        assert_close(two(histograms, histograms), one(histograms, histograms), atol=0, rtol=0)
-        for name, value in two.state_dict().items():
-            assert torch.equal(value, state[name]), name
-
-
 @pytest.mark.parametrize("share", [-0.1, 1.1])
 def test_share_out_of_range_is_refused(share):
     with pytest.raises(ValueError, match="share"):

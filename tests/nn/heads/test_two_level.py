@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from igps.nn.heads.two_level import TwoLevelHead
 from igps.nn.heads.wccn import WCCNHead
-from igps.retrieval import cosine, retrieval_scores
+from igps.retrieval import cosine
 
 N_CLASSES = 16
 N_BODIES = 4
@@ -106,74 +106,6 @@ def test_with_lengths_distances_are_those_of_mahalanobis(collection):
     assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
 
 
-@pytest.mark.parametrize("same_class", [0.55, 0.1])
-def test_the_distance_is_what_the_formula_says(same_class, collection, monkeypatch):
-    """Against the formula in float64; the last number of a vector with `lengths` does not enter its distance."""
-    monkeypatch.setattr("igps.nn.heads.two_level._SAME_CLASS", same_class)
-    histograms, classes, bodies = collection
-    class_head = WCCNHead(n_directions=20)
-    body_heads = (
-        WCCNHead((0,), n_directions=6, lengths=True),
-        WCCNHead((1,), n_directions=5, lengths=True),
-    )
-    head = TwoLevelHead(
-        class_head,
-        body_heads,
-        scales=(0.2, 0.3),
-        exponents=(0.3, 0.7),
-        share=0.3,
-    )
-    vectors = head.fit(histograms, classes, (15, 25), bodies=bodies)(histograms)
-    assert_close(
-        vectors.norm(dim=1),
-        torch.ones(len(vectors)),
-        atol=1e-5,
-        rtol=0,
-    )
-    x, y, z = (one(histograms).double() for one in (class_head, *body_heads))
-    products = 0.7 * x @ x.T + 0.15 * y @ y.T + 0.15 * z @ z.T
-    assert_close((vectors @ vectors.T).double(), products, atol=1e-5, rtol=0)
-    assert_close(
-        head.within_class(vectors)[:, :7].double(),
-        0.15**0.5 * y,
-        atol=1e-6,
-        rtol=0,
-    )
-    first, second = (
-        torch.cdist(
-            one[:, :-1],
-            one[:, :-1],
-            compute_mode="donot_use_mm_for_euclid_dist",
-        )
-        for one in (y, z)
-    )
-    apart = first**0.3 * second**0.7
-    usual = 0.5 / 2**0.5
-    from_mean = ((y[:, :-1].norm(dim=1) ** 2 + z[:, :-1].norm(dim=1) ** 2) / 2).sqrt()
-    shorter = (torch.outer(from_mean, from_mean).sqrt() / usual).sqrt()
-    by_class = 1 - x @ x.T
-    all_near = torch.exp(
-        -((by_class / same_class) ** 20)
-        - (first * shorter / 0.2) ** 20
-        - (second * shorter / 0.3) ** 20
-    )
-    near = torch.exp(-((apart / 0.1) ** 20))
-    expected = 0.95 * by_class * (1 - all_near) * (1 - near) + 0.05 * (
-        1 - torch.exp(-((apart / 0.1) ** 2))
-    )
-    found = head.distances(vectors, vectors).double()
-    assert_close(found, expected, atol=1e-4, rtol=0)
-    assert_close(
-        head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0
-    )
-    assert ((all_near > 0.2) & (all_near < 0.9)).any()  # each case occurs
-    assert ((near > 0.2) & (near < 0.9)).any()
-    assert ((first < 0.15) & (all_near < 0.1)).any()
-    assert ((second < 0.25) & (all_near < 0.1)).any()
-    assert same_class > 0.1 or ((first < 0.15) & (second < 0.25) & (all_near < 0.1)).any()
-    assert ((shorter < 0.95) | (shorter > 1.05)).double().mean() > 0.5
-
-
 def test_body_heads_can_have_shapes_of_their_own(collection):
     histograms, classes, bodies = collection
     head = TwoLevelHead().fit(
@@ -229,43 +161,6 @@ def test_distances_of_equal_vectors_have_a_gradient(collection):
     assert torch.isfinite(slope).all()
 
 
-def test_body_heads_fitted_to_individuals_order_them_better_than_those_fitted_to_bodies():
-    """On other classes. Poses change the first cells, individuals the last ones, by less than bodies differ."""
-    generator = torch.Generator().manual_seed(1)
-    shape = (12, 2, 3, 4)  # classes, bodies, individuals, poses
-    kinds = torch.randn(12, 1, 1, 1, N_CELLS, generator=generator)
-    of_bodies = torch.randn(12, 2, 1, 1, 4, generator=generator) @ torch.randn(
-        4, N_CELLS, generator=generator
-    )
-    of_poses = torch.zeros(*shape, N_CELLS)
-    of_individuals = torch.zeros(*shape, N_CELLS)
-    of_poses[..., :10] = torch.randn(*shape, 10, generator=generator)
-    of_individuals[..., 30:] = torch.randn(12, 2, 3, 1, 10, generator=generator)
-    cells = (
-        (0.8 * kinds + 0.3 * of_bodies + 0.3 * of_poses + 0.05 * of_individuals).exp().flatten(0, 3)
-    )
-    histograms = cells / cells.sum(dim=1, keepdim=True)
-    individuals = torch.arange(72).repeat_interleave(4)
-    bodies = individuals // 3
-    classes = individuals // 6
-    seen = classes < 6
-    found = []
-    for fitted_to in (bodies, individuals):
-        head = TwoLevelHead(body_heads=[WCCNHead(n_directions=20, lengths=True)])
-        head.fit(histograms[seen], classes[seen], bodies=fitted_to[seen])
-        vectors = head(histograms[~seen])
-        distances = head.distances(vectors, vectors)
-        found.append(
-            [
-                retrieval_scores(distances, one[~seen]).mean()["ft"]
-                for one in (individuals, bodies, classes)
-            ]
-        )
-    assert found[1][0] > found[0][0] + 0.1
-    assert found[1][1] > found[0][1] - 0.02
-    assert found[1][2] > found[0][2] - 0.02
-
-
 def test_short_vectors_span_the_leading_singular_directions(collection, monkeypatch):
     """Against NumPy's SVD for 7 numbers; if all numbers fit, the cosines do not change."""
     histograms, classes, bodies = collection
@@ -284,28 +179,6 @@ def test_short_vectors_span_the_leading_singular_directions(collection, monkeypa
     expected = vectors.double().numpy() @ axes[:7].T
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-4)
-
-
-def test_it_is_stored_and_loaded(collection):
-    histograms, classes, bodies = collection
-    fitted = TwoLevelHead(
-        WCCNHead((0,), 5), [WCCNHead((1,), 6, lengths=True)], scales=[0.3], share=0.3
-    )
-    fitted.fit(histograms, classes, (15, 25), bodies=bodies)
-    other = TwoLevelHead(
-        WCCNHead((0,)),
-        [WCCNHead((1,), lengths=True)],
-    )
-    other.load_state_dict(fitted.state_dict())
-    assert_close(other(histograms), fitted(histograms))
-    vectors = other(histograms)
-    assert vectors.shape == (len(histograms), 5 + 6 + 1)
-    assert_close(other.distances(vectors, vectors), fitted.distances(vectors, vectors))
-    assert_close(other.shorten(vectors), fitted.shorten(vectors))
-    level = WCCNHead((1,))  # the state includes `lengths`
-    level.load_state_dict(fitted.body_heads[0].state_dict())
-    expected = fitted.body_heads[0](histograms)
-    assert_close(level(histograms), expected)
 
 
 @pytest.mark.parametrize(

@@ -287,29 +287,6 @@ def test_names_are_axes(batch):
     assert torch.equal(named(batch), made(batch))
 
 
-@pytest.mark.parametrize(
-    ("axes", "shape"),
-    [
-        ([InteriorDistance(5)], (1, 5)),
-        (
-            [InteriorDistance(5), Potential(3), EuclideanDistance(2), Attribute("depth", DEPTH)],
-            (45, 5, 2),
-        ),
-        (
-            [PairCosines(3), EuclideanDistance(2), Potential(2), InteriorDistance(5)],
-            (3, 2, 5, 3, 3, 3),
-        ),
-        ([PairCosines(2), EmbeddedPairCosines(3)], (1, 2, 2, 2, 3, 3, 3)),
-    ],
-)
-def test_order_of_the_dimensions(batch, axes, shape):
-    """Pairs of classes; distances in the given order; cosines in the given order."""
-    histogram = PairHistogram(axes)
-    assert histogram.shape == shape
-    assert histogram.n_cells == np.prod(shape)
-    assert histogram(batch).shape == (2, *shape)
-
-
 def test_needs_are_those_of_all_axes():
     far = SpectralEmbedding(n_eigenpairs=30)
     axes = [
@@ -420,27 +397,6 @@ def test_gradient_through_classes_and_layout():
     for gradient in grad(histogram(*leaves).square().sum(), leaves):
         assert (gradient.abs() > 1e-6).any()
     assert torch.autograd.gradcheck(histogram, leaves)
-
-
-def test_layout_survives_its_state():
-    def made(reach):
-        depth = Attribute("depth", [0.1, 0.3], soft=True, learnable=True)
-        pairs = [InteriorDistance(6, reach, learnable=True), EuclideanDistance(5, learnable=True)]
-        return PairHistogram([Potential(soft=True, learnable=True), depth, *pairs])
-
-    layer = made(4.0)
-    fresh = made(9.0)
-    learn(layer)
-    fresh.load_state_dict(layer.state_dict())
-    embedding, points, _ = some(30)
-    batch = batch_of(
-        embedding[None],
-        None,
-        points[None],
-        {"depth": points[None, :, 0]},
-    )
-    assert torch.equal(fresh(batch), layer(batch))
-    assert not torch.equal(made(4.0)(batch), layer(batch))
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from batches import alone, embedded, scaled, two_bodies
+from batches import embedded, two_bodies
 from igps.nn import functional
 from igps.nn.axes import BallRadius, EuclideanDistance, Potential
 from igps.nn.batch_features import SampleFeatures
@@ -55,17 +55,6 @@ def test_it_is_the_share_of_samples_in_each_cell():
         )
         expected = memberships.mean(axis=0)
         np.testing.assert_allclose(found[i].flatten(), expected, atol=1e-6)
-
-
-def test_padding_and_scale_change_nothing():
-    batch = two_bodies()
-    histogram = layout()
-    found = histogram(batch)
-    expected = torch.ones(2)
-    assert_close(found.flatten(1).sum(dim=1), expected)
-    for i in range(2):
-        assert_close(histogram(alone(batch, i))[0], found[i])
-    assert_close(histogram(scaled(batch, 3.0)), found, atol=1e-5, rtol=0)
 
 
 def test_a_subset_of_the_samples_is_counted():

@@ -7,7 +7,6 @@ from torch.testing import assert_close
 
 from batches import alone, two_bodies
 from igps.data.batch import SignatureBatch
-from igps.nn._kernels.batches import map_by_size
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.histograms.pairs import PairHistogram
 
@@ -20,45 +19,6 @@ def bodies(*copies):
         many = body.interior.map(lambda one, n=n: torch.cat([one] * n, dim=1))
         found.append(replace(body, interior=many))
     return SignatureBatch.concatenate(found)
-
-
-@pytest.mark.parametrize(
-    ("copies", "on_cpu", "widths"),
-    [
-        ((1, 50, 2, 40), True, [(2, 80), (1, 2000), (1, 1600)]),  # large bodies are not copied
-        ((40, 1, 31, 20), False, [(2, 1600), (1, 800), (1, 40)]),
-        ((50, 40, 45), True, [(3, 2000)]),
-    ],
-)
-def test_groups_are_padded_to_their_largest_body(copies, on_cpu, widths, request):
-    if not on_cpu:
-        request.getfixturevalue("without_loops")
-    batch = bodies(*copies)
-    found = []
-
-    def sums(group):
-        found.append(tuple(group.interior.mask.shape))
-        return group.interior.points.sum(dim=(1, 2))
-
-    expected = batch.interior.points.sum(dim=(1, 2))
-    assert_close(map_by_size(sums, batch), expected)
-    assert found == widths
-
-
-def test_a_batch_may_have_samples_of_one_kind_only():
-    batch = bodies(1, 50)
-    batch = replace(
-        batch,
-        surface=batch.surface.map(lambda values: values[:, :0]),
-    )
-    found = map_by_size(lambda group: group.area, batch).tolist()
-    assert found == batch.area.tolist()
-
-
-def test_padding_beyond_the_largest_body_is_cut():
-    batch = bodies(1, 50, 2)[[0, 2]]
-    found = map_by_size(lambda group: group.interior.points, batch).shape
-    assert found == (2, 80, 3)
 
 
 @pytest.mark.parametrize("several", [False, True])
