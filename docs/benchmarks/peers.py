@@ -1,8 +1,9 @@
 """`igps fit` and a learned layout beside networks and plain numbers. The program behind the page.
 
     python -m docs.benchmarks.peers families FOLDER METHODS
+    python -m docs.benchmarks.peers collection ROOT CACHE METHODS
     python -m docs.benchmarks.peers adrenals FOLDER CACHE METHODS
-    python -m docs.benchmarks.peers one_out FOLDER CACHE METHODS
+    python -m docs.benchmarks.peers held_out ROOT CACHE METHODS
 
 METHODS is a list such as [numbers,fit]. All get the same bodies to train on, and the same to be tested on. Networks
 have one size, one rate and one number of steps, set before the first run.
@@ -13,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from statistics import mean, stdev
@@ -23,16 +25,16 @@ from docs.benchmarks.layout import families
 from jsonargparse import auto_cli
 from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.linear_model import LogisticRegression
-from sklearn.metrics import balanced_accuracy_score, roc_auc_score
+from sklearn.model_selection import KFold, StratifiedKFold
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor, nn
 
 import igps
 from igps.cli import errors_as_messages
-from igps.data.sources import Bodies
+from igps.data.splits import split_seen
 from igps.descriptors.with_numbers import Numbers
-from igps.learning.fitting import classify
+from igps.learning.fitting import classification_scores, classify
 from igps.nn import Classifier
 from igps.signature.voxels import grid_axes, inside_grid
 
@@ -40,6 +42,8 @@ N_POINTS, N_NEIGHBOURS = 1024, 10
 N_EIGENPAIRS, N_CHANNELS, N_TIMES = 60, 64, 16
 N_GRID = 28
 N_BATCH, N_STEPS, RATE = 8, 100, 5e-3
+SEEDS = (200, 201, 202, 203, 204)
+N_LABELS = (1, 3, 5, 10)
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class Task:
     dataset: igps.SignatureDataset
     train: list[int]
     test: list[int]
+    n_steps: int = N_STEPS
 
     @property
     def n_classes(self) -> int:
@@ -99,7 +104,7 @@ def _fitted(task: Task, name: str) -> Tensor:
     descriptor = igps.descriptor(name)
     rows = igps.describe(task.bodies, descriptor, n_workers=1)
     distances = descriptor.distances(rows[len(train) :], rows[: len(train)])
-    return -distances[:, train.labels.argsort()]
+    return (-distances[:, train.labels.argsort()]).softmax(dim=1)
 
 
 def layout(task: Task) -> Tensor:
@@ -220,14 +225,7 @@ def resnet(task: Task) -> Tensor:
     """ResNet-18 with 3D kernels on a grid of 28³."""
     from monai.networks.nets import resnet18
 
-    bodies = task.bodies
-    grids = torch.zeros(len(bodies), 1, N_GRID, N_GRID, N_GRID)
-    for i, grid in enumerate(grids[:, 0]):
-        mesh = bodies.mesh(i)
-        inside = torch.from_numpy(inside_grid(mesh, grid_axes(mesh, N_GRID)))
-        x, y, z = ((N_GRID - n) // 2 for n in inside.shape)
-        n_x, n_y, n_z = inside.shape
-        grid[x : x + n_x, y : y + n_y, z : z + n_z] = inside
+    grids = torch.stack([_grid(task.dataset, i) for i in task.train + task.test])
     model = resnet18(
         spatial_dims=3,
         n_input_channels=1,
@@ -238,15 +236,27 @@ def resnet(task: Task) -> Tensor:
     return _trained(task, model, lambda indices: model(grids[indices]))
 
 
+@cache
+def _grid(dataset: igps.SignatureDataset, index: int) -> Tensor:
+    """Return whether each of 28³ grid points around a body is inside: (1, 28, 28, 28) of 0 and 1."""
+    mesh = dataset.mesh(index)
+    inside = torch.from_numpy(inside_grid(mesh, grid_axes(mesh, N_GRID)))
+    x, y, z = ((N_GRID - n) // 2 for n in inside.shape)
+    n_x, n_y, n_z = inside.shape
+    grid = torch.zeros(1, N_GRID, N_GRID, N_GRID)
+    grid[0, x : x + n_x, y : y + n_y, z : z + n_z] = inside
+    return grid
+
+
 def _trained(task: Task, model: nn.Module, logits: Callable[[list[int]], Tensor]) -> Tensor:
     """Train a network with Adam and weights of the classes, and return probabilities (N, n_classes) of the others."""
     n_train = len(task.train)
     labels = task.bodies.labels[:n_train]
     weights = n_train / (task.n_classes * torch.bincount(labels, minlength=task.n_classes))
     optimizer = torch.optim.Adam(model.parameters(), lr=RATE)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=N_STEPS)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=task.n_steps)
     model.train()
-    for _ in range(N_STEPS):
+    for _ in range(task.n_steps):
         chosen = torch.randperm(n_train)[:N_BATCH].tolist()
         loss = nn.functional.cross_entropy(logits(chosen), labels[chosen], weights)
         optimizer.zero_grad()
@@ -271,7 +281,7 @@ METHODS: dict[str, Callable[[Task], Tensor]] = {
 }
 
 
-def run(name: str, task: Task, seed: int) -> tuple[Tensor, float]:
+def ask(name: str, task: Task, seed: int) -> tuple[Tensor, float]:
     """Return the answers (N, n_classes) of a method, and the core-seconds that it took."""
     torch.manual_seed(seed)
     start = time.process_time()
@@ -279,79 +289,127 @@ def run(name: str, task: Task, seed: int) -> tuple[Tensor, float]:
     return found, time.process_time() - start
 
 
+def scores(found: Tensor, task: Task) -> dict[str, float]:
+    """Return accuracy, balanced accuracy and area under the curve of answers, in percent."""
+    labels = task.dataset.labels[task.test]
+    of_all = classification_scores(found, labels, torch.arange(task.n_classes))
+    return {name: 100 * of_all[name] for name in ("accuracy", "balanced_accuracy", "auc")}
+
+
+def report(title: str, rows: list[dict[str, float]]) -> None:
+    """Print mean and standard deviation of each score over the runs."""
+    texts = []
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        spread = f" ± {stdev(values):.1f}" if len(values) > 1 else ""
+        texts.append(f"{name} {mean(values):.1f}{spread}")
+    print(f"{title}, {len(rows)} runs: {', '.join(texts)}", flush=True)
+
+
 def run_adrenals(
-    root: Path, cache_dir: Path, methods: list[str], seeds: tuple[int, ...] = (200,)
+    root: Path,
+    cache_dir: Path,
+    methods: list[str],
+    seeds: tuple[int, ...] = SEEDS,
+    n_steps: int = N_STEPS,
 ) -> None:
-    """Train on `train`, and print area under the curve and balanced accuracy on `val`."""
+    """Train on `train`, and print scores on `val`."""
     torch.set_num_threads(1)
     paths = sorted(root.glob("*/*/*.nii.gz"))
-    dataset = igps.SignatureDataset(
-        paths,
-        descriptor=igps.descriptor("pretrained"),
-        cache_dir=cache_dir,
-        labels=[path.parts[-2] for path in paths],
-    )
+    labels = [path.parts[-2] for path in paths]
+    dataset = _dataset(paths, cache_dir, labels)
     train = [i for i, path in enumerate(paths) if path.parts[-3] == "train"]
     test = [i for i, path in enumerate(paths) if path.parts[-3] == "val"]
-    labels = dataset.labels[test].numpy()
+    task = Task(dataset, train, test, n_steps)
     for name in methods:
+        rows = []
         for seed in seeds:
-            found, seconds = run(name, Task(dataset, train, test), seed)
-            auc = 100 * roc_auc_score(labels, found[:, 1])
-            balanced = 100 * balanced_accuracy_score(labels, found.argmax(dim=1))
-            print(f"{name} {seed}: AUC {auc:.1f}, balanced {balanced:.1f}, {seconds:.0f} s")
+            found, seconds = ask(name, task, seed)
+            rows.append(scores(found, task) | {"seconds": seconds})
+            report(f"adrenals, {name}, {n_steps} steps", rows)
 
 
-def run_one_out(root: Path, cache_dir: Path, methods: list[str], seed: int = 200) -> None:
-    """Ask for each body of a folder after training on all others, and print balanced accuracy."""
+def run_held_out(
+    root: Path,
+    cache_dir: Path,
+    methods: list[str],
+    seeds: tuple[int, ...] = SEEDS,
+    n_folds: int | None = None,
+    n_steps: int = N_STEPS,
+) -> None:
+    """Ask for each body of a folder after training on other folds, by default on all others, and print scores."""
     torch.set_num_threads(1)
-    pretrained = igps.descriptor("pretrained")
-    dataset = igps.SignatureDataset(root, descriptor=pretrained, cache_dir=cache_dir)
-    everyone = range(len(dataset))
+    dataset = _dataset(root, cache_dir)
+    labels = dataset.labels.numpy()
+    everyone = Task(dataset, [], list(range(len(dataset))))
     for name in methods:
-        answers = []
-        seconds = 0.0
-        for i in everyone:
-            others = [k for k in everyone if k != i]
-            found, cost = run(name, Task(dataset, others, [i]), seed)
-            answers.append(int(found.argmax()))
-            seconds += cost
-        balanced = 100 * balanced_accuracy_score(dataset.labels.numpy(), answers)
-        print(f"{name}: balanced accuracy {balanced:.1f}, {seconds / len(dataset):.1f} s a fit")
+        rows = []
+        for seed in seeds:
+            folds = KFold(len(dataset))
+            if n_folds is not None:
+                folds = StratifiedKFold(n_folds, shuffle=True, random_state=seed)
+            answers = torch.zeros(len(dataset), len(dataset.classes))
+            costs = []
+            for train, test in folds.split(labels, labels):
+                task = Task(dataset, train.tolist(), test.tolist(), n_steps)
+                found, seconds = ask(name, task, seed)
+                answers[test] = found.float()
+                costs.append(seconds)
+            rows.append(scores(answers, everyone) | {"seconds of a fit": mean(costs)})
+            report(f"{name}, {n_folds or len(dataset)} folds, {n_steps} steps", rows)
 
 
 def run_families(
     folder: Path,
     methods: list[str],
-    seeds: tuple[int, ...] = (200, 201, 202, 203, 204),
-    labels: tuple[int, ...] = (1, 3, 5, 10),
+    seeds: tuple[int, ...] = SEEDS,
+    labels: tuple[int, ...] = N_LABELS,
+    n_steps: int = N_STEPS,
 ) -> None:
     """Train on a few bodies of each family, and print how many of two other bodies in two poses are recognised."""
     torch.set_num_threads(1)
     dataset = families(folder, igps.descriptor("interior"), igps.descriptor("pretrained"))
+    _few_labels(dataset, split_families, methods, seeds, labels, n_steps)
+
+
+def run_collection(
+    root: Path,
+    cache_dir: Path,
+    methods: list[str],
+    seeds: tuple[int, ...] = SEEDS,
+    labels: tuple[int, ...] = N_LABELS,
+    n_steps: int = N_STEPS,
+) -> None:
+    """Train on a few bodies of each class, and print how many of those beyond ten of a class are recognised."""
+    torch.set_num_threads(1)
+    _few_labels(_dataset(root, cache_dir), split_classes, methods, seeds, labels, n_steps)
+
+
+def _few_labels(
+    dataset: igps.SignatureDataset,
+    split: Callable[[igps.SignatureDataset, int, int], tuple[list[int], list[int]]],
+    methods: list[str],
+    seeds: tuple[int, ...],
+    labels: tuple[int, ...],
+    n_steps: int,
+) -> None:
     for name in methods:
         for n_labels in labels:
-            shares = []
-            seconds = []
+            rows = []
             for seed in seeds:
-                train, test = draw(dataset.bodies, n_labels, seed)
-                found, cost = run(name, Task(dataset, train, test), seed)
-                is_right = found.argmax(dim=1) == dataset.labels[test]
-                shares.append(100 * float(is_right.float().mean()))
-                seconds.append(cost)
-            spread = stdev(shares) if len(shares) > 1 else 0.0
-            print(
-                f"{name}, {n_labels} labels: {mean(shares):.1f} ± {spread:.1f} over {len(seeds)}, "
-                f"{mean(seconds):.1f} s",
-                flush=True,
-            )
+                task = Task(dataset, *split(dataset, n_labels, seed), n_steps)
+                found, seconds = ask(name, task, seed)
+                rows.append(scores(found, task) | {"seconds": seconds})
+            report(f"{name}, {n_labels} labels, {n_steps} steps", rows)
 
 
-def draw(bodies: Bodies, n_labels: int, seed: int) -> tuple[list[int], list[int]]:
+def split_families(
+    dataset: igps.SignatureDataset, n_labels: int, seed: int
+) -> tuple[list[int], list[int]]:
     """Return the shapes to train on, and all poses of the two bodies of each class that are tested."""
     generator = np.random.default_rng(seed)
-    owners = np.array(["/".join(name.split("/")[:2]) for name in bodies.names])
-    labels = np.array(bodies.labels)
+    owners = np.array(["/".join(name.split("/")[:2]) for name in dataset.bodies.names])
+    labels = np.array(dataset.bodies.labels)
     train: list[int] = []
     test: list[int] = []
     for label in np.unique(labels):
@@ -364,6 +422,37 @@ def draw(bodies: Bodies, n_labels: int, seed: int) -> tuple[list[int], list[int]
     return train, test
 
 
+def split_classes(
+    dataset: igps.SignatureDataset, n_labels: int, seed: int
+) -> tuple[list[int], list[int]]:
+    """Return some of the ten bodies of each class that `docs.benchmarks.learning` trains on, and those it tests."""
+    split = split_seen(dataset.labels, max(N_LABELS), seed=seed)
+    generator = np.random.default_rng(seed)
+    candidates = generator.permutation(split.train)
+    labels = dataset.labels.numpy()[candidates]
+    train: list[int] = []
+    for label in np.unique(labels):
+        train += candidates[labels == label][:n_labels].tolist()
+    return train, list(split.test)
+
+
+def _dataset(
+    root: Path | list[Path], cache_dir: Path, labels: list[str] | None = None
+) -> igps.SignatureDataset:
+    """Return a collection with all that the methods need, after its signatures are computed."""
+    needed = igps.descriptor("interior").requirements | igps.descriptor("pretrained").requirements
+    dataset = igps.SignatureDataset(root, descriptor=needed, cache_dir=cache_dir, labels=labels)
+    dataset.precompute(strict=True, n_workers=1)
+    return dataset
+
+
 if __name__ == "__main__":
     with errors_as_messages():
-        auto_cli({"adrenals": run_adrenals, "one_out": run_one_out, "families": run_families})
+        auto_cli(
+            {
+                "adrenals": run_adrenals,
+                "collection": run_collection,
+                "families": run_families,
+                "held_out": run_held_out,
+            }
+        )
