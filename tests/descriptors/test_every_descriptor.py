@@ -22,6 +22,7 @@ from igps.data.batch import SignatureBatch
 from igps.data.collation import collate
 from igps.data.requirements import Requirements
 from igps.descriptors import NAMES, descriptor
+from igps.descriptors.registry import FIELD_NAMES
 from igps.mesh.mesh import Mesh
 from igps.nn.axes import Attribute
 from igps.nn.descriptor import BodyDescriptor, EmbeddedDescriptor, HistogramDescriptor
@@ -235,13 +236,33 @@ def modules_of(name):
     return {type(one) for one in descriptor(name).modules()}
 
 
-@pytest.mark.parametrize("name", [*NAMES, "interior+size"])
+def assert_without_values(found, expected):
+    shapes = {key: value.shape for key, value in expected.state_dict().items()}
+    assert {key: value.shape for key, value in found.state_dict().items()} == shapes
+    assert all(value.is_meta for value in [*found.parameters(), *found.buffers()])
+
+
+@pytest.mark.parametrize(
+    "name", [*NAMES, *FIELD_NAMES, "interior+size", "interior+side", "rich+ct+side+size"]
+)
 def test_a_descriptor_that_is_made_on_the_device_meta_has_no_values(name):
     with torch.device("meta"):
         found = igps.descriptor(name)
-    shapes = {key: value.shape for key, value in igps.descriptor(name).state_dict().items()}
-    assert {key: value.shape for key, value in found.state_dict().items()} == shapes
-    assert all(value.is_meta for value in found.state_dict().values())
+    assert_without_values(found, igps.descriptor(name))
+
+
+@pytest.mark.parametrize("name", ["interior", "pretrained", "interior+side"])
+def test_a_file_that_is_loaded_on_the_device_meta_has_no_values(name, tmp_path):
+    path = tmp_path / "mine.safetensors"
+    saved = igps.descriptor(name)
+    saved.save(path)
+    with torch.device("meta"):
+        found = igps.load(path)
+        by_name = igps.descriptor(path)
+        both = igps.descriptor(saved, size="keep")
+    assert_without_values(found, saved)
+    assert_without_values(by_name, saved)
+    assert not any(value.is_meta for value in both.buffers())
 
 
 def fewer_samples(batch, n):

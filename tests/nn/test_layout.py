@@ -1,22 +1,30 @@
 """A layout that is learned starts as the fixed one, and only what was asked for is learned."""
 
+from dataclasses import replace
+
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 import igps
 from batches import two_bodies
 from bodies import bumpy_sphere
+from igps.descriptors.registry import FIELD_NAMES, NAMES
 from igps.nn.axes import Attribute, InteriorDistance, PairTwist, Potential
 from igps.nn.histograms.pairs import PairHistogram
 
 PARTS = ("bins", "classes", "filter")
 # A description is a histogram of sum 1 or, by `pretrained`, made of vectors of length 1.
-HISTOGRAMS = ["interior", "gps", "multiscale", "rich", "interior+size", "rich+side", "pretrained"]
+WITH_LAYOUT = {"interior", "gps", "multiscale", "rich", "pretrained", "fold", "molecular"}
+COMBINED = ["interior+size", "rich+side", "interior+depth"]
 
 
 @pytest.fixture(scope="module")
 def batch():
-    """A body with hollows and the same stretched, with what every descriptor of histograms needs."""
+    """A body with hollows and the same stretched, with what every descriptor of histograms needs.
+
+    The attributes of molecules are made up.
+    """
     config = igps.SignatureConfig(n_surface_samples=150, resolution=10, min_samples=0)
     for name in ("interior", "rich", "pretrained"):
         config = igps.descriptor(name).requirements.apply_to(config)
@@ -28,12 +36,41 @@ def batch():
         )
         for stretch in (1, 2)
     ]
-    return igps.collate([igps.compute_signature(body, config) for body in bodies])
+    found = igps.collate([igps.compute_signature(body, config) for body in bodies])
+    return replace(found, interior=with_residues(found.interior))
 
 
-@pytest.mark.parametrize("name", HISTOGRAMS)
+def with_residues(samples):
+    """Add the attributes of molecules to samples, each of which is a residue of its own."""
+    generator = torch.Generator().manual_seed(3)
+    shape = samples.mask.shape
+    directions = torch.randn(*shape, 3, generator=generator)
+    rises = 1.5 + 2 * torch.rand(*shape, 1, generator=generator)
+    places = torch.arange(shape[1]).expand(shape).unsqueeze(2)
+    values = {
+        "trace": torch.cat([20 * samples.points, normalize(directions, dim=2), rises, places], 2),
+        "residue_shares": torch.rand(*shape, 25, generator=generator).softmax(dim=2),
+    }
+    for name in ("charge", "screened_potential", "hydropathy"):
+        values[name] = torch.randn(shape, generator=generator)
+    return replace(samples, attributes={**samples.attributes, **values})
+
+
+@pytest.mark.parametrize("name", [*NAMES, *FIELD_NAMES])
+def test_every_descriptor_has_a_layout_to_learn_or_says_that_it_has_none(name):
+    if name in WITH_LAYOUT:
+        assert list(igps.descriptor(name, learnable=True).parameters())
+        return
+    with pytest.raises(ValueError, match="learnable: expected a descriptor whose histograms have"):
+        igps.descriptor(name, learnable=True)
+
+
+@pytest.mark.parametrize("name", [*sorted(WITH_LAYOUT), *COMBINED])
 def test_a_learned_layout_starts_as_the_fixed_one(name, batch):
     fixed = igps.descriptor(name)
+    for module in fixed.modules():
+        if isinstance(module, Attribute) and not module.is_fitted:
+            module.fit(batch.interior.attributes[module.name].flatten())
     learned = igps.descriptor(fixed, learnable=True)
     found = learned(batch)  # with gradients, as in training
     difference = (found.detach() - fixed(batch)).flatten(1).abs().sum(dim=1)

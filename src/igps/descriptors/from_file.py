@@ -41,6 +41,9 @@ def load(path: str | Path) -> Descriptor:
         FileNotFoundError: there is no such file.
         ValueError: the file is damaged, or does not hold a descriptor.
     """
+    if torch.get_default_device().type == "meta":  # without values, which are checked here
+        with torch.device("cpu"):
+            return load(path).to("meta")
     if str(path).lower().endswith(_YAML):
         return load_yaml(path)
     module, card = load_module(path)

@@ -87,6 +87,17 @@ def descriptor(
         ValueError: no descriptor has this name, or the file is not valid, see `load`; or the
             descriptor has no such layout to learn.
     """
+    if torch.get_default_device().type == "meta":  # without values, which are checked here
+        with torch.device("cpu"):
+            made = descriptor(
+                which,
+                size=size,
+                mirror=mirror,
+                units=units,
+                learnable=learnable,
+                n_training_samples=n_training_samples,
+            )
+        return made if isinstance(which, Descriptor) else made.to("meta")
     check_one_of(get_args(Size), size=size)
     check_one_of(get_args(Mirror), mirror=mirror)
     if size == "auto" and units is None:
@@ -98,14 +109,9 @@ def descriptor(
         suffixes = _SIZE_OR_SIDE.findall(which)
         which = _SIZE_OR_SIDE.sub("", which)
     parts = layout_parts(learnable)
-    device = torch.get_default_device()
-    is_meta = device.type == "meta"  # without values, which are checked here
-    with torch.device("cpu" if is_meta else device):
-        base = _base_descriptor(which)
-        if parts or n_training_samples is not None:
-            base = with_layout(base, parts, n_training_samples)
-    if is_meta and base is not which:
-        base = base.to(device)
+    base = _base_descriptor(which)
+    if parts or n_training_samples is not None:
+        base = with_layout(base, parts, n_training_samples)
     compares_size = size == "keep" if units is None else keeps_size(size, units)[0]
     with_size = compares_size or SIZE in suffixes
     with_side = mirror == "distinct" or SIDE in suffixes

@@ -80,7 +80,7 @@ class _Copying:
         if not isinstance(module, Specified) or isinstance(module, Head):
             return copy.deepcopy(module)
         arguments = module.made_with()
-        if isinstance(module, SampleHistogram):
+        if isinstance(module, SampleHistogram) and "embedding" in _options(module):
             arguments["embedding"] = module.embedding
         if isinstance(module, AxesHistogram):
             arguments["axes"] = list(module.axes)
@@ -96,12 +96,19 @@ class _Copying:
 
     def _changes(self, module: Specified) -> dict[str, Any]:
         """Return the arguments by which a module differs from its copy."""
-        if isinstance(module, SampleHistogram) and self._n_training_samples is not None:
-            return {"n_training_samples": self._n_training_samples}
         if isinstance(module, SpectralEmbedding):
             is_new = "filter" in self._parts and module.log_gain is None
             return {"n_knots": _N_KNOTS} if is_new else {}
+        changes: dict[str, Any] = {}
+        if isinstance(module, SampleHistogram) and self._n_training_samples is not None:
+            changes["n_training_samples"] = self._n_training_samples
         part = "classes" if isinstance(module, PointAxis) else "bins"
-        has_choice = "learnable" in inspect.signature(type(module)).parameters
-        is_axis = isinstance(module, PointAxis | PairAxis)
-        return {"learnable": True} if is_axis and has_choice and part in self._parts else {}
+        has_layout = isinstance(module, PointAxis | PairAxis | SampleHistogram)
+        if has_layout and part in self._parts and "learnable" in _options(module):
+            changes["learnable"] = True
+        return changes
+
+
+def _options(module: nn.Module) -> Collection[str]:
+    """Return the names of the arguments by which a module is made."""
+    return inspect.signature(type(module)).parameters

@@ -47,18 +47,25 @@ class FoldHistogram(SampleHistogram):
     is the nearest of a sample counts once, however many samples are near it.
 
     Args:
-        n_samples: see `SampleHistogram`.
+        n_samples, n_training_samples: see `SampleHistogram`.
+        learnable: whether the centres of rises, distances, angles and twists are parameters.
     """
 
     degree = 2
     label = "fold"
 
-    def __init__(self, n_samples: int | None = _N_SAMPLES) -> None:
-        super().__init__("interior", n_samples)
+    def __init__(
+        self,
+        n_samples: int | None = _N_SAMPLES,
+        n_training_samples: int | None = None,
+        *,
+        learnable: bool = False,
+    ) -> None:
+        super().__init__("interior", n_samples, n_training_samples)
         self.separations = OrderedCentres(_SEPARATIONS)
-        self.rises = OrderedCentres(_RISES)
-        self.distances = OrderedCentres(_DISTANCES)
-        self.turns = OrderedCentres(_TURNS)
+        self.rises = OrderedCentres(_RISES, learnable)
+        self.distances = OrderedCentres(_DISTANCES, learnable)
+        self.turns = OrderedCentres(_TURNS, learnable)
         self.embedding = SpectralEmbedding(n_eigenpairs=1)  # none is used
 
     @property
