@@ -10,8 +10,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from bodies_on_disk import write_body
 
+from bodies_on_disk import write_body
 from commands import run
 from igps.cli.precompute_command import dask_executor, of_shard
 from igps.data.dataset import SignatureDataset

@@ -6,8 +6,8 @@ import time
 from pathlib import Path
 
 import pytest
-from bodies_on_disk import write_body
 
+from bodies_on_disk import write_body
 from igps.data.dataset import SignatureDataset
 from igps.signature.signature import SignatureConfig
 
