@@ -79,16 +79,14 @@ def test_some_memory_is_available():
     assert 0 < free < 1 << 50
 
 
-def group(folder, version, most, used, cached):
+def group(folder, most, used, cached):
     """Files of a control group."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = ("memory.limit_in_bytes", "memory.usage_in_bytes")
-    if version == 2:
-        names = ("memory.max", "memory.current")
-    for name, value in zip(names, (most, used), strict=True):
-        (folder / name).write_text(f"{value}\n")
-    cache = "inactive_file" if version == 2 else "total_inactive_file"
-    (folder / "memory.stat").write_text(f"active_file 7\nsome_{cache} 3\n{cache} {cached}\n")
+    (folder / "memory.max").write_text(f"{most}\n")
+    (folder / "memory.current").write_text(f"{used}\n")
+    (folder / "memory.stat").write_text(
+        f"active_file 7\nsome_inactive_file 3\ninactive_file {cached}\n"
+    )
 
 
 def test_the_groups_around_a_process_bound_its_memory(tmp_path):
@@ -96,21 +94,21 @@ def test_the_groups_around_a_process_bound_its_memory(tmp_path):
     root = tmp_path / "groups"
     own.write_text("0::/job/step\n")
     assert limits._memory_in_groups(root, own) is None
-    group(root / "job" / "step", 2, "max", 300, 0)
+    group(root / "job" / "step", "max", 300, 0)
     assert limits._memory_in_groups(root, own) is None
-    group(root / "job", 2, 1000, 400, 150)  # of all steps together; files that were read can go
+    group(root / "job", 1000, 400, 150)  # of all steps together; files that were read can go
     assert limits._memory_in_groups(root, own) == 1000 - 400 + 150
-    group(root / "job" / "step", 2, 500, 300, 0)
+    group(root / "job" / "step", 500, 300, 0)
     assert limits._memory_in_groups(root, own) == 200
 
 
 def test_a_container_has_its_group_as_the_root(tmp_path):
     own = tmp_path / "own"
     root = tmp_path / "groups"
-    own.write_text("9:name=systemd:/\n4:cpu,memory:/docker/0815\n")
-    group(root / "memory", 1, 2000, 1500, 100)
+    own.write_text("0::/docker/0815\n")
+    group(root, 2000, 1500, 100)
     assert limits._memory_in_groups(root, own) == 600
-    group(root / "memory" / "docker" / "0815", 1, 1000, 900, 0)
+    group(root / "docker" / "0815", 1000, 900, 0)
     assert limits._memory_in_groups(root, own) == 100
     assert limits._memory_in_groups(tmp_path / "nowhere", tmp_path / "nothing") is None
 

@@ -53,25 +53,6 @@ def test_parts_that_do_not_touch_or_are_open_are_left_to_the_grid():
         assert "united" not in steps
 
 
-def with_wall():
-    """A body of two boxes of one size, with the wall between them still there."""
-    vertices, faces = box([0, 0, 0], [1, 1, 1])
-    # The same triangles on both sides of the wall
-    mirrored = vertices * [-1, 1, 1] + [2, 0, 0]
-    return together(
-        (vertices, faces),
-        (mirrored, faces[:, ::-1]),
-    )
-
-
-def test_a_wall_between_two_halves_is_dropped_and_nothing_else():
-    body = mend(*with_wall())
-    assert any("dropped 1 wall inside" in note for note in body.notes)
-    assert "watertight" not in repair_steps(body.notes)
-    found = (body.volume, body.area)
-    assert_allclose(found, (2, 10), rtol=1e-12)
-
-
 def test_two_halves_with_a_wall_each_that_overlap_are_the_body_that_they_were_cut_from():
     import manifold3d
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch.autograd import forward_ad, grad
+from torch.autograd import grad
 from torch.testing import assert_close
 
 import igps.nn.functional as functional
@@ -144,31 +144,6 @@ def test_double_precision_stays_double(module):
         rtol=0,
         atol=1e-12,
     )
-
-
-def test_transforms_of_functions_follow_a_histogram(module):
-    """`torch.func.grad` gives what a backward pass gives, and `jvp` what it says of a direction."""
-    batch = two_bodies().to(torch.float64)
-    module = module.double().eval()
-    upstream = torch.randn(
-        2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
-    )
-
-    def loss(area):
-        return (module(replace(batch, area=area)) * upstream).sum()
-
-    area = batch.area.clone().requires_grad_()
-    (expected,) = grad(loss(area) + 0 * area.sum(), area)
-    found = torch.func.grad(loss)(batch.area)
-    assert_close(found, expected)
-    direction = torch.tensor([1.0, -2.0]).double()
-    assert_close(
-        torch.func.jvp(loss, (batch.area,), (direction,))[1],
-        expected @ direction,
-    )
-    with forward_ad.dual_level():
-        along = forward_ad.unpack_dual(loss(forward_ad.make_dual(batch.area, direction))).tangent
-        assert_close(torch.zeros(()).double() if along is None else along, expected @ direction)
 
 
 def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differences(module):

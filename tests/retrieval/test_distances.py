@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.distance import cdist
 from sklearn.metrics.pairwise import additive_chi2_kernel
 from torch import Tensor
-from torch.autograd import forward_ad, grad
+from torch.autograd import grad
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -174,55 +174,6 @@ def test_gradients_agree_with_finite_differences(distance):
     queries = (10 * queries + 0.1).requires_grad_()
     gallery = (10 * gallery + 0.1).requires_grad_()
     assert torch.autograd.gradcheck(distance, (queries, gallery))
-
-
-@pytest.mark.parametrize("distance", ALL)
-@pytest.mark.parametrize("side", [0, 1])
-def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(distance, side):
-    both = [
-        histograms(3, (40,), seed=25),
-        histograms(2, (40,), seed=26),
-    ]
-    both[1][1] = both[0][2]  # at distance zero
-    along = histograms(
-        len(both[side]),
-        (40,),
-        seed=29,
-        filled=2,
-    )
-    upstream = histograms(3, (2,), seed=30, filled=2)
-    leaf = both[side].requires_grad_()
-    [gradient] = grad(
-        (distance(*both) * upstream).sum(),
-        leaf,
-    )
-    expected = (gradient * along).sum()
-
-    def of_side(rows):
-        given = [one.detach() for one in both]
-        given[side] = rows
-        return (distance(*given) * upstream).sum()
-
-    plain = leaf.detach()
-    with forward_ad.dual_level():
-        found = [forward_ad.unpack_dual(of_side(forward_ad.make_dual(plain, along))).tangent]
-    found += [
-        torch.func.jvp(of_side, (plain,), (along,))[1],
-        (torch.func.grad(of_side)(plain) * along).sum(),
-    ]
-    for one in found:
-        assert_close(one, expected, rtol=1e-9, atol=0)
-
-
-@pytest.mark.parametrize("distance", ALL)
-def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_differences(distance):
-    queries = histograms(3, (20,), seed=31, filled=2)
-    gallery = histograms(4, (20,), seed=32, filled=2)
-    along = histograms(3, (20,), seed=33, filled=2)
-    gradient = torch.func.grad(lambda rows: distance(rows, gallery).square().sum())
-    found = torch.func.jvp(gradient, (queries,), (along,))[1]
-    expected = (gradient(queries + 1e-6 * along) - gradient(queries - 1e-6 * along)) / 2e-6
-    assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula():

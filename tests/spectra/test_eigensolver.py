@@ -1,7 +1,5 @@
 """The eigensolver against dense solvers, closed forms and invariances."""
 
-import logging
-
 import igl
 import lapy
 import numpy as np
@@ -269,18 +267,6 @@ def test_falls_back_to_arpack_with_a_warning(torus_problem, monkeypatch, caplog)
     assert_allclose(spectrum.eigenvalues, expected.eigenvalues, rtol=1e-10)
     assert_pairs(spectrum, torus_problem)
     assert "falling back to ARPACK: on purpose" in caplog.text
-
-
-def test_a_shift_below_the_spectrum_takes_over(torus_problem, torus_oracle, monkeypatch, caplog):
-    stiffness, mass, positions = torus_problem
-    monkeypatch.setattr("igps.spectra._lanczos._factorize_inside", fail)
-    with caplog.at_level(logging.INFO):
-        spectrum = eigenpairs(stiffness, mass, 80, positions=positions)
-    expected = torus_oracle[0][1:81]
-    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
-    assert_pairs(spectrum, torus_problem)
-    assert "falling back to a shift below the spectrum: on purpose" in caplog.text
-    assert "ARPACK" not in caplog.text
 
 
 def test_incomplete_or_wrong_pairs_are_not_returned(torus_problem, monkeypatch):

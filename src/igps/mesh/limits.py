@@ -97,35 +97,18 @@ def _memory_in_limits() -> int | None:
 def _memory_in_groups(
     root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")
 ) -> int | None:
-    """Return the minimum over the control group of the process and its parents, for cgroup versions 1 and 2."""
-    lines = [line.split(":", 2) for line in _text(own).splitlines()]
+    """Return the minimum over the control group of the process and its parents, for cgroup version 2."""
+    group = re.search(r"^0::/(.*)$", _text(own), re.MULTILINE)
+    path = root / (group[1] if group else "")
     available = []
-    for mount, limit, usage, cache, controller in (
-        (root, "memory.max", "memory.current", "inactive_file", ""),
-        (
-            root / "memory",
-            "memory.limit_in_bytes",
-            "memory.usage_in_bytes",
-            "total_inactive_file",
-            "memory",
-        ),
-    ):
-        paths = [
-            line[2].strip("/")
-            for line in lines
-            if len(line) == 3 and controller in line[1].split(",")
-        ]
-        # A container may see its own group as the root, whatever the path says.
-        for folder in {
-            folder for path in ["", *paths] for folder in (mount / path, *(mount / path).parents)
-        }:
-            max_bytes = _number(folder / limit)
-            current = _number(folder / usage)
-            if max_bytes is not None and current is not None:
-                # The kernel frees cached files when memory is needed.
-                available.append(
-                    max_bytes - current + (_number(folder / "memory.stat", rf"^{cache}\s+") or 0)
-                )
+    # A container may see its own group as the root, whatever the path says.
+    for folder in (path, *path.parents, root):
+        max_bytes = _number(folder / "memory.max")
+        current = _number(folder / "memory.current")
+        if max_bytes is not None and current is not None:
+            # The kernel frees cached files when memory is needed.
+            cached = _number(folder / "memory.stat", r"^inactive_file\s+") or 0
+            available.append(max_bytes - current + cached)
     return min(available, default=None)
 
 

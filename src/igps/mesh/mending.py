@@ -22,7 +22,7 @@ from igps.mesh._tidying import (
     tidy,
     weld,
 )
-from igps.mesh._union import drop_inner_walls, unite_parts
+from igps.mesh._union import unite_parts
 from igps.mesh.denoising import is_noisy, remove_noise
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh, check_arrays, check_coordinates, check_size
@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
 
-MENDING_VERSION = 11
+MENDING_VERSION = 12
 """Part of the cache keys of mended bodies; incremented whenever mending a surface gives another body."""
 
 # Steps by the first words of their notes
@@ -65,9 +65,9 @@ def mend(
     """Make a body of a surface in any state, by as few repairs as possible.
 
     Repairs are made in this order, until the surface is a body: weld coincident vertices, drop degenerate and duplicate
-    faces, and orient the faces; drop fins and specks; fill small holes; drop closed parts inside the body; drop inner
-    walls, or unite overlapping closed parts; make it `watertight`. A body that is rough with scanner noise is smoothed,
-    because noise adds area. A body of fewer than `least_vertices` vertices is subdivided, longest edges first.
+    faces, and orient the faces; drop fins and specks; fill small holes; drop closed parts inside the body; unite
+    overlapping closed parts; make it `watertight`. A body that is rough with scanner noise is smoothed, because noise
+    adds area. A body of fewer than `least_vertices` vertices is subdivided, longest edges first.
 
     Args:
         vertices: (V, 3) positions, any length unit.
@@ -152,13 +152,8 @@ class _Mending:
             body = self._body(vertices, faces, notes)
             if body is not None:
                 return body
-        # These steps may give no body if there are many loose parts; their result is then discarded.
-        if len(faces):
-            with_walls = list(notes)
-            body = self._body(*drop_inner_walls(vertices, faces, with_walls), with_walls)
-        if body is None:
-            united: list[str] = []
-            body = self._body(*unite_parts(*original, united), united)
+        united: list[str] = []
+        body = self._body(*unite_parts(*original, united), united)
         if body is not None:
             return body
         body = watertight(self._smooth(vertices, faces, notes), faces, name=self.name)

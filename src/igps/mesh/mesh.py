@@ -19,7 +19,6 @@ from igps.mesh.surface import (
     diagonal,
     directed_edges,
     face_areas,
-    face_patches,
     signed_volume,
     undirected_edges,
 )
@@ -325,18 +324,20 @@ def _check_topology(
 
 
 def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
+    import igl
+
     surfaces = connected(vertices, faces)
     volumes = [signed_volume(*surface) for surface in surfaces]
     outer = int(np.argmax(volumes))
     for k, (points, triangles) in enumerate(surfaces):
         if k == outer:
             continue
-        # Patches that meet in a vertex are one connected surface.
-        patch, _ = face_patches(triangles, len(points))
-        patch_volumes = [
+        # Surfaces that meet in a vertex are one connected surface, but not one patch.
+        _, patch = igl.bfs_orient(triangles)
+        volumes_of_patches = [
             signed_volume(points, triangles[patch == i]) for i in range(patch.max() + 1)
         ]
-        is_outward = max(patch_volumes) >= 0
+        is_outward = max(volumes_of_patches) >= 0
         lies_inside = winding_number(*surfaces[outer], points).min() >= 0.5
         # The cavity's own surface is left out: at its vertices, its winding number may be anything
         # from 0 to 1.

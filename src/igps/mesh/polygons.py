@@ -5,9 +5,6 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps.mesh.surface import dots, sums
 
-# Larger polygons are cut into fans: ear clipping takes quadratic time or worse.
-_MAX_EAR_CORNERS = 2000
-
 
 def triangles(corners: Integers, n_corners: Integers) -> Integers:
     """Cut polygons, whose corners are laid end to end, into fans of triangles (F, 3) around their first corners.
@@ -41,8 +38,7 @@ def strip_triangles(corners: Integers) -> Integers:
 def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> Integers:
     """Triangulate as `triangles` does, except for polygons whose fans would fold over themselves.
 
-    Those polygons are triangulated by ear clipping (Meisters 1975), and come last. A polygon that crosses itself may
-    run out of ears; what is left of it is cut into a fan. Polygons of fewer than three corners are dropped.
+    Those polygons are triangulated by manifold3d, and come last. Polygons of fewer than three corners are dropped.
     """
     has_area = n_corners >= 3
     corners = corners[np.repeat(has_area, n_corners)]
@@ -65,40 +61,23 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
         is_flipped = along_total < -1e-9 * squared[owner]
     is_folded = np.zeros(len(n_corners), dtype=bool)
     is_folded[owner[is_flipped]] = True
-    is_folded &= n_corners <= _MAX_EAR_CORNERS
     fans = triangles(corners[~is_folded[owner]], n_corners[~is_folded])
     clipped = [
-        _clip_ears(corners[starts[i] :][: n_corners[i]], vertices, total[i])
+        _triangulated(corners[starts[i] :][: n_corners[i]], vertices, total[i])
         for i in np.flatnonzero(is_folded)
     ]
     return np.concatenate([fans, *clipped])
 
 
-def _clip_ears(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
-    """Triangulate a polygon (n,), which may be concave, into (n − 2, 3) triangles."""
-    remaining = polygon.tolist()
-    ears = []
-    at = 0
-    n_tried = 0
-    while n_tried <= len(remaining) > 3:
-        a, b, c = (remaining[(at + k) % len(remaining)] for k in (-1, 0, 1))
-        triangle = vertices[[a, b, c]]
-        sides = np.roll(triangle, -1, axis=0) - triangle
-        others = vertices[[k for k in remaining if k not in (a, b, c)]]
-        # On which side of each side of the triangle the other corners lie, (n, 3)
-        beside = np.cross(sides, others[:, None] - triangle) @ normal
-        is_convex = np.cross(sides[0], sides[1]) @ normal > 0
-        is_empty = not (beside >= 0).all(axis=1).any()
-        if is_convex and is_empty:
-            ears.append((a, b, c))
-            del remaining[at]
-            at = at % len(remaining)
-            n_tried = 0
-        else:
-            at = (at + 1) % len(remaining)
-            n_tried = n_tried + 1
-    fan = [(remaining[0], remaining[k], remaining[k + 1]) for k in range(1, len(remaining) - 1)]
-    return np.array([*ears, *fan], dtype=np.int64)
+def _triangulated(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
+    """Triangulate a polygon (n,), which may be concave, into (n − 2, 3) triangles, in the plane across its normal."""
+    import manifold3d
+
+    across = np.linalg.svd(normal[None])[2][1:]
+    if np.linalg.det([normal, *across]) < 0:
+        across = across[::-1]
+    corners = (vertices[polygon] - vertices[polygon[0]]) @ across.T
+    return np.asarray(polygon[manifold3d.triangulate([corners])])
 
 
 def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:

@@ -109,13 +109,8 @@ def undirected_edges(faces: Integers, n_vertices: int) -> tuple[Integers, Intege
 def components(faces: Integers, n_vertices: int) -> tuple[int, NDArray[np.int32]]:
     """Return the number of connected components, and the component (V,) of each vertex, from 0."""
     start, end = directed_edges(faces)
-    return _connected(start, end, n_vertices)
-
-
-def _connected(start: Integers, end: Integers, n: int) -> tuple[int, NDArray[np.int32]]:
-    """Return the number of components of the graph of n nodes with these edges, and that of each."""
     ones = np.ones(len(start), dtype=np.int8)
-    graph = sparse.coo_array((ones, (start, end)), shape=(n, n))
+    graph = sparse.coo_array((ones, (start, end)), shape=(n_vertices, n_vertices))
     count, label = connected_components(graph, directed=False)
     return int(count), label
 
@@ -126,29 +121,6 @@ def face_parts(vertices: Floats, faces: Integers) -> tuple[Integers, Floats]:
     _, part = np.unique(component[faces[:, 0]], return_inverse=True)
     areas = np.bincount(part, weights=face_areas(vertices, faces))
     return part.astype(np.int64), np.asarray(areas, dtype=np.float64)
-
-
-def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
-    """Return the patch (F,) of each face, from 0, and which patches (P,) end only where two other faces meet.
-
-    Two faces belong to one patch if they share an edge with no other face.
-    """
-    _, edge_of_side = undirected_edges(faces, n_vertices)
-    by_edge = np.argsort(edge_of_side, kind="stable")
-    count = np.bincount(edge_of_side)
-    at = (np.cumsum(count) - count)[count == 2]
-    one_face = by_edge[at] // 3
-    other_face = by_edge[at + 1] // 3
-    n_patches, patch = _connected(one_face, other_face, len(faces))
-    # Faces of the patch itself do not count, also where several of them meet in an edge.
-    sides = np.stack([np.repeat(patch, 3), edge_of_side])
-    pairs, n_own = np.unique(sides, axis=1, return_counts=True)
-    patch_at = pairs[0]
-    n_at = count[pairs[1]]
-    is_free = (n_at - n_own < 2) & (n_at != 2)
-    n_free = np.bincount(patch_at, is_free, n_patches)
-    n_crowded = np.bincount(patch_at, n_at > 2, n_patches)
-    return patch.astype(np.int64), (n_free == 0) & (n_crowded > 0)
 
 
 def signed_volume(vertices: Floats, faces: Integers) -> float:

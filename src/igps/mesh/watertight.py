@@ -14,7 +14,6 @@ largest piece alone, it is far worse.
 from dataclasses import replace
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers
@@ -29,15 +28,12 @@ from igps.mesh._level_set import (
     merge_near_vertices,
 )
 from igps.mesh._outside import OrientedSurface, find_outside
+from igps.mesh._tidying import are_specks, places
 from igps.mesh.errors import MeshError
 from igps.mesh.isosurface import level_surface, simplify_surface
 from igps.mesh.mesh import Mesh, check_coordinates
-from igps.mesh.surface import diagonal, face_areas, largest, longest_side, unit
+from igps.mesh.surface import diagonal, face_areas, face_parts, largest, longest_side, unit
 
-# Groups of triangles of less than this share of the area are specks, if a grid of this many cells per side separates
-# them from all others.
-_SPECK_AREA = 2e-3
-_SPECK_CELLS = 64
 # Thickness (volume over area, half a rod's radius) in cells: the grid is refined up to the first as far as its size
 # allows, and bodies below the second get a note that they are coarse.
 _FINE = 1.5
@@ -88,7 +84,11 @@ def watertight(
         raise MeshError(
             f"{name}: expected a surface, but no triangle has an area. Give lines some thickness."
         )
-    faces = _drop_specks(vertices, faces, notes)
+    part, areas = face_parts(vertices, places(vertices)[faces])
+    is_speck = are_specks(areas)
+    if is_speck.any():
+        notes.append(f"dropped {counted(int(is_speck.sum()), 'speck')}")
+        faces = faces[~is_speck[part]]
     default_size, min_size = cell_sizes(vertices, faces, resolution, spacing)
     grid = Grid.around(vertices, faces, min_size)
     vertices = grid.to_cells(vertices)
@@ -124,44 +124,6 @@ def crosses_itself(vertices: Floats, faces: Integers) -> bool:
 
     surface = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
     return bool(find_self_intersections(*surface, first_only=True)[0])
-
-
-def _drop_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Integers:
-    """Drop groups of faces that are separate from all others and have next to no area."""
-    corners = vertices[faces]
-    low = corners.min(axis=(0, 1))
-    side = longest_side(corners.reshape(-1, 3))
-    cell = side / _SPECK_CELLS
-    points, face = _sample_triangles(corners, cell)
-    index = np.floor((points - low) / cell).astype(np.int64) + 1
-    occupied = np.zeros(index.max(axis=0) + 2, dtype=bool)
-    occupied[tuple(index.T)] = True
-    label, count = ndimage.label(occupied, structure=np.ones((3, 3, 3)))
-    group = np.zeros(len(faces), dtype=np.int64)
-    group[face] = label[tuple(index.T)]
-    area = face_areas(vertices, faces)
-    share = np.bincount(group, weights=area, minlength=count + 1) / area.sum()
-    is_kept = (share >= _SPECK_AREA)[group]
-    # If much of the area is in such small groups, none is a speck.
-    if is_kept.all() or area[is_kept].sum() < 0.98 * area.sum():
-        return faces
-    notes.append(f"dropped {len(np.unique(group[~is_kept]))} specks")
-    return _drop_specks(vertices, faces[is_kept], notes)
-
-
-def _sample_triangles(corners: Floats, spacing: float) -> tuple[Floats, Integers]:
-    """Return points on triangles, at most about `spacing` apart, and the triangle of each point."""
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    n_parts = np.clip(np.ceil(longest / spacing), 1, 4 * _SPECK_CELLS).astype(np.int64)
-    points = []
-    owner = []
-    for n in np.unique(n_parts):
-        i, j = np.nonzero(np.add.outer(np.arange(n + 1), np.arange(n + 1)) <= n)
-        weights = np.stack([i, j, n - i - j], axis=1) / n
-        triangle = np.nonzero(n_parts == n)[0]
-        points.append(np.einsum("pi,fij->fpj", weights, corners[triangle]).reshape(-1, 3))
-        owner.append(np.repeat(triangle, len(weights)))
-    return np.concatenate(points), np.concatenate(owner)
 
 
 def splats(

@@ -9,7 +9,6 @@ from igps.nn._kernels.batches import map_bodies
 from igps.nn._kernels.neighbours import ball_radii, smallest
 from igps.nn._precision import full_precision
 from igps.nn.embedding import barycentroid_potential
-from igps.retrieval.distances import row_distances
 from igps.signature.signature import SampleKind
 
 WEIGHT = "weight"
@@ -136,7 +135,7 @@ def nearest_directions(
     """
     with full_precision():
         real = targets.detach().masked_fill(~mask.unsqueeze(-1), _FAR_AWAY)
-        distances = row_distances(points.detach(), real, "use_mm_for_euclid_dist_if_necessary")
+        distances = torch.cdist(points.detach(), real)
     nearest, indices = smallest(distances, min(n_nearest, mask.shape[-1]))
     is_real = (nearest < _FAR_AWAY).unsqueeze(-1)
     rows = indices.flatten(-2).unsqueeze(-1).expand(*indices.shape[:-2], -1, points.shape[-1])
@@ -156,7 +155,9 @@ def nearest_neighbours(
     if not (n_points := points.shape[-2]):
         raise ValueError("samples: expected at least one of each body, got none.")
     with full_precision():
-        squares = row_distances(points.detach(), points.detach(), "use_mm_for_euclid_dist")
+        squares = torch.cdist(
+            points.detach(), points.detach(), compute_mode="use_mm_for_euclid_dist"
+        )
     squares.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
     if mask is not None:
         squares.masked_fill_(~mask.unsqueeze(-2), torch.inf)

@@ -7,7 +7,6 @@ from torch import Tensor, nn
 
 from igps._parameters import check_at_least
 from igps.nn.specification import Specified
-from igps.retrieval.distances import row_distances
 
 # Range of λ·area: from below the smallest of elongated bodies to beyond the 250th of any body (4π·250, Weyl's law).
 _FILTER_RANGE = (2.0, 5000.0)
@@ -32,7 +31,7 @@ def spectral_embedding(
 
 def interior_distance(p: Tensor, q: Tensor) -> Tensor:
     """Return Euclidean distances (..., P, Q) of embeddings (..., P, K) and (..., Q, K) (Rustamov 2010, equation 5)."""
-    return row_distances(p, q)
+    return torch.cdist(p, q, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def barycentroid_potential(embedding: Tensor) -> Tensor:

@@ -4,8 +4,8 @@ Smaller is closer, identical descriptors have distance exactly 0, and a distance
 symmetric. All dimensions after the first are cells of a histogram or entries of a vector.
 
 All functions run on the device of their inputs, and in float32 for inputs in half precision. They are differentiable:
-χ² any number of times, the others once, or any number of times under `torch.func`. They raise a ValueError for
-unsuitable shapes, dtypes or devices, for NaN or infinity, and χ² for negative entries; the check waits for the device.
+χ² any number of times, the others once. They raise a ValueError for unsuitable shapes, dtypes or devices, for NaN or
+infinity, and χ² for negative entries; the check waits for the device.
 """
 
 import math
@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from igps._threads import Team
 from igps.retrieval.distance_loops import fill
@@ -31,8 +30,6 @@ _CELLS_PER_TILE = 4096
 _TRIPLES_PER_THREAD = 2**24
 # Fewer triples take PyTorch less than ten milliseconds; to load the compiled loops takes half a second.
 _MIN_TRIPLES = 2**22
-# Squared distances below this share of the sum of the two squared lengths are rounding errors of double precision.
-_CANCELLATION = 1e-14
 
 
 def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
@@ -57,8 +54,6 @@ def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
         (Q, G) distances, without unit.
     """
     a, b = _as_rows(queries, gallery, non_negative=True)
-    if in_transforms():
-        return _chi_square_by_torch(a, b)
     return _ChiSquare.apply(a, b)
 
 
@@ -125,15 +120,10 @@ def _chi_square_by_torch(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _uses_loops(a: Tensor, b: Tensor) -> bool:
-    """Whether compiled loops can read rows, on the CPU and not traced or transformed, and are worth being loaded."""
-    if a.device.type != "cpu" or torch.compiler.is_compiling() or in_transforms():
+    """Whether compiled loops can read rows, on the CPU and not traced, and are worth being loaded."""
+    if a.device.type != "cpu" or torch.compiler.is_compiling():
         return False
     return len(a) * len(b) * a.shape[1] > _MIN_TRIPLES
-
-
-def in_transforms() -> bool:
-    """Return whether a transform of `torch.func` or forward-mode differentiation is active."""
-    return torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
 
 
 def _sums_by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
@@ -190,27 +180,8 @@ def _row_distance(a: Tensor, b: Tensor) -> Tensor:
     needs_gradients = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
     if _uses_loops(a, b) and not needs_gradients:
         return _sums_by_loops(a, b, chi_square=False).sqrt_()
-    return row_distances(a, b)
-
-
-# By default without the faster matrix product, whose cancellation leaves non-zero distances on the diagonal.
-def row_distances(
-    a: Tensor, b: Tensor, compute_mode: str = "donot_use_mm_for_euclid_dist"
-) -> Tensor:
-    """Euclidean distances (..., I, J) of rows (..., I, D) and (..., J, D); for the mode see `torch.cdist`."""
-    if not in_transforms():
-        return torch.cdist(a, b, compute_mode=compute_mode)
-    # `torch.cdist` has no forward-mode and no second derivatives. Double precision reduces the product's cancellation.
-    centre = a.detach().mean(dim=-2, keepdim=True)
-    x = (a - centre).double()
-    y = (b - centre).double()
-    x_squares = x.square().sum(dim=-1)
-    y_squares = y.square().sum(dim=-1)
-    sums = x_squares.unsqueeze(-1) + y_squares.unsqueeze(-2)
-    squares = sums - 2 * x @ y.mT
-    is_positive = squares > _CANCELLATION * sums
-    roots = torch.where(is_positive, squares, 1).sqrt()
-    return torch.where(is_positive, roots, 0).to(a.dtype)
+    # Without the faster matrix product, whose cancellation leaves non-zero distances on the diagonal.
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def square_root(values: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Block Lanczos iteration with a shift inside the wanted part of the spectrum, or below it; see `eigensolver`."""
+"""Block Lanczos iteration with a shift inside the wanted part of the spectrum; see `eigensolver`."""
 
 import logging
 import math
@@ -20,18 +20,16 @@ logger = logging.getLogger(__name__)
 
 # Share of the wanted eigenvalues below the shift, at which both ends of the spectrum converge at the same time.
 SHIFT_RANK = 0.55
-# The shift below the spectrum, in units of 1/area.
-SHIFT_BELOW = -1.0
 # Number of vectors in a block. Small blocks make a small basis, large ones fast products. Small ones are better for few
 # eigenpairs, and for results with very many numbers, where the basis takes gigabytes.
 SMALL_BLOCK = 8
 LARGE_BLOCK = 12
 MAX_SMALL_BLOCK_PAIRS = 128
 MAX_LARGE_BLOCK_RESULT = 2**27
-# Basis size at which usually all pairs have converged, as measured on bodies of 11,000 vertices: vectors per eigenpair
-# with the shift inside or below, plus a number of blocks, which grows with the decades of the number of eigenpairs and
-# with the digits of the tolerance beyond seven.
-BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW = 1.35, 2.35
+# Basis size at which usually all pairs have converged, as measured on bodies of 11,000 vertices: vectors per eigenpair,
+# plus a number of blocks, which grows with the decades of the number of eigenpairs and with the digits of the tolerance
+# beyond seven.
+BASIS_PER_EIGENPAIR = 1.35
 BASIS_BLOCKS, BASIS_BLOCKS_PER_DECADE, BASIS_BLOCKS_PER_DIGIT = 2.4, 4.8, 1.0
 # The iteration stops at this multiple of the vectors per eigenpair, plus a constant.
 MAX_BASIS_FACTOR, MAX_BASIS_EXTRA = 3, 600
@@ -55,12 +53,8 @@ def lanczos(
     positions: np.ndarray | None,
     tolerance: float,
     seed: int,
-    inside: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return eigenvalues (K,) and orthonormal eigenvectors (V, K) of a matrix with one zero mode (V,), of length 1.
-
-    A shift inside the spectrum is fast. With a shift below it, A − σI is definite, and its factors are accurate.
-    """
+    """Return eigenvalues (K,) and orthonormal eigenvectors (V, K) of a matrix with one zero mode (V,), of length 1."""
     # Solves are faster if vectors are stored in elimination order.
     tree, matrix, order = analyse(matrix, positions).arranged(matrix)
     zero_mode = zero_mode[order]
@@ -69,23 +63,16 @@ def lanczos(
         or n_eigenpairs * len(zero_mode) > MAX_LARGE_BLOCK_RESULT
     )
     block_size = SMALL_BLOCK if is_small else LARGE_BLOCK
-    per_eigenpair = BASIS_PER_EIGENPAIR if inside else BASIS_PER_EIGENPAIR_BELOW
     digits = -math.log10(max(tolerance, ROUNDING)) - 7
     n_blocks = BASIS_BLOCKS + BASIS_BLOCKS_PER_DECADE * math.log10(n_eigenpairs)
     n_blocks = max(1, n_blocks + BASIS_BLOCKS_PER_DIGIT * digits)
-    first_size = math.ceil(per_eigenpair * n_eigenpairs + n_blocks * block_size)
-    max_size = math.ceil(MAX_BASIS_FACTOR * per_eigenpair * n_eigenpairs) + MAX_BASIS_EXTRA
+    first_size = math.ceil(BASIS_PER_EIGENPAIR * n_eigenpairs + n_blocks * block_size)
+    max_size = math.ceil(MAX_BASIS_FACTOR * BASIS_PER_EIGENPAIR * n_eigenpairs) + MAX_BASIS_EXTRA
     max_size = min(max_size, len(zero_mode) - 2 * block_size)
     generator = np.random.default_rng(seed)
     with Team(None if n_eigenpairs * len(zero_mode) >= MIN_TEAM_RESULT else 1) as team:
-        if inside:
-            shift, factors = _factorize_inside(
-                tree, matrix, zero_mode, n_eigenpairs, tolerance, team
-            )
-        else:
-            shift = SHIFT_BELOW
-            factors = tree.factorize(matrix, SHIFT_BELOW, team)
-        n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
+        shift, factors = _factorize_inside(tree, matrix, zero_mode, n_eigenpairs, tolerance, team)
+        n_below = factors.n_negative - 1  # without the zero mode
         krylov = Krylov(
             factors, zero_mode, block_size, first_size + 3 * block_size, generator, team
         )

@@ -21,9 +21,8 @@ The algorithm is block Lanczos with a shift inside the wanted part of the spectr
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -49,6 +48,13 @@ REORDERED_ROWS = 2**12
 MAX_DENSE_VERTICES, MAX_DENSE_VERTICES_PER_EIGENPAIR = 1000, 4
 
 Solver = Callable[[], tuple[np.ndarray, np.ndarray]]
+
+_FAILURES = (
+    ConvergenceError,
+    SingularMatrixError,
+    np.linalg.LinAlgError,
+    torch.linalg.LinAlgError,
+)
 
 
 @dataclass(frozen=True)
@@ -126,10 +132,8 @@ def eigenpairs(
     def dense() -> tuple[np.ndarray, np.ndarray]:
         return eigh(matrix.toarray(), subset_by_index=(1, n_eigenpairs), overwrite_a=True)
 
-    def krylov(inside: bool) -> tuple[np.ndarray, np.ndarray]:
-        return lanczos(
-            matrix, np.sqrt(mass / area), n_eigenpairs, positions, tolerance, seed, inside
-        )
+    def krylov() -> tuple[np.ndarray, np.ndarray]:
+        return lanczos(matrix, np.sqrt(mass / area), n_eigenpairs, positions, tolerance, seed)
 
     def arpack() -> tuple[np.ndarray, np.ndarray]:
         n_computed = min(n_eigenpairs + N_GUARDS, len(mass) - 2)
@@ -139,48 +143,36 @@ def eigenpairs(
         return eigenvalues[:n_eigenpairs], eigenfunctions[:, :n_eigenpairs] * np.sqrt(mass)[:, None]
 
     is_small = len(mass) <= max(MAX_DENSE_VERTICES, MAX_DENSE_VERTICES_PER_EIGENPAIR * n_eigenpairs)
-    solvers: list[Solver] = (
-        [dense, arpack] if is_small else [partial(krylov, True), partial(krylov, False), arpack]
-    )
-    eigenvalues, vectors, residual = _first_success(solvers, matrix, tolerance)
+    try:
+        eigenvalues, vectors, residual = _refined(dense if is_small else krylov, matrix, tolerance)
+    except _FAILURES as error:
+        logger.warning("falling back to ARPACK: %s", error)
+        try:
+            eigenvalues, vectors, residual = _refined(arpack, matrix, tolerance)
+        except _FAILURES as last:
+            raise ConvergenceError(
+                f"no solver reached the tolerance; the last error: {last}"
+            ) from last
     vectors /= np.sqrt(mass)[:, None]
     return Spectrum(eigenvalues / area, vectors, mass, residual)
 
 
-def _first_success(
-    solvers: Sequence[Solver], matrix: sparse.csr_array, tolerance: float
+def _refined(
+    solver: Solver, matrix: sparse.csr_array, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return eigenvalues (K,), orthonormal eigenvectors (V, K) and largest residual of the first solver to succeed."""
-    for solver in solvers:
-        try:
-            eigenvalues, vectors = solver()
-            residual, correction = _residual(matrix, eigenvalues, vectors, tolerance)
-            # Rayleigh quotients: unlike (A − σI)⁻¹ near an eigenvalue, A y has no large rounding errors.
-            eigenvalues = eigenvalues + correction
-            order = np.argsort(eigenvalues, kind="stable")
-            if (order[1:] < order[:-1]).any():  # possible in a multiplet
-                eigenvalues = eigenvalues[order]
-                for start in range(
-                    0, len(vectors), REORDERED_ROWS
-                ):  # in parts: a full copy may take gigabytes
-                    rows = vectors[start : start + REORDERED_ROWS]
-                    rows[:] = rows[:, order]
-            return eigenvalues, vectors, residual
-        except (
-            ConvergenceError,
-            SingularMatrixError,
-            np.linalg.LinAlgError,
-            torch.linalg.LinAlgError,
-        ) as error:
-            if solver is solvers[-1]:
-                raise ConvergenceError(
-                    f"no solver reached the tolerance; the last error: {error}"
-                ) from error
-            if solver is solvers[-2]:
-                logger.warning("falling back to ARPACK: %s", error)
-            else:
-                logger.info("falling back to a shift below the spectrum: %s", error)
-    raise AssertionError("unreachable")
+    """Return the eigenvalues (K,) and orthonormal eigenvectors (V, K) of a solver, and their largest residual."""
+    eigenvalues, vectors = solver()
+    residual, correction = _residual(matrix, eigenvalues, vectors, tolerance)
+    # Rayleigh quotients: unlike (A − σI)⁻¹ near an eigenvalue, A y has no large rounding errors.
+    eigenvalues = eigenvalues + correction
+    order = np.argsort(eigenvalues, kind="stable")
+    if (order[1:] < order[:-1]).any():  # possible in a multiplet
+        eigenvalues = eigenvalues[order]
+        # In parts: a full copy may take gigabytes.
+        for start in range(0, len(vectors), REORDERED_ROWS):
+            rows = vectors[start : start + REORDERED_ROWS]
+            rows[:] = rows[:, order]
+    return eigenvalues, vectors, residual
 
 
 def _arpack(

@@ -224,36 +224,6 @@ def test_a_head_of_ones_own_is_stored_and_loaded(dataset, tmp_path):
     )
 
 
-def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_numbers(dataset):
-    """By the places of samples; `torch.cdist` has none of them, and pieces of one sample have no spread."""
-    batch = dataset.batch([0]).to(torch.float64)
-    pretrained = igps.descriptor("pretrained").double()
-    surface = batch.surface.subset(60, 0)
-    batch = replace(
-        batch,
-        interior=batch.interior.subset(60, 0),
-        surface=surface,
-    )
-    generator = torch.Generator().manual_seed(2)
-    places = batch.surface.points
-    along = torch.randn(1, 60, 3, generator=generator).double()
-    upstream = torch.randn(pretrained.n_features, generator=generator).double()
-
-    def loss(points):
-        moved = replace(batch, surface=replace(surface, points=points))
-        return (pretrained(moved) * upstream).sum()
-
-    leaf = places.clone().requires_grad_()
-    expected = (torch.autograd.grad(loss(leaf), leaf)[0] * along).sum()
-    assert_close(
-        torch.func.jvp(loss, (places,), (along,))[1],
-        expected,
-        rtol=1e-6,
-        atol=0,
-    )
-    assert torch.isfinite(torch.func.jvp(torch.func.grad(loss), (places,), (along,))[1]).all()
-
-
 def test_a_file_of_another_head_is_named(tmp_path):
     path = tmp_path / "other.safetensors"
     save_file({"head.mean": torch.zeros(3)}, path)

@@ -1,10 +1,7 @@
 """Histograms of samples and their directions in cylindrical coordinates about the principal axes of a body."""
 
-from contextlib import nullcontext
-
 import torch
 from torch import Tensor, nn
-from torch.autograd import forward_ad
 from torch.nn.functional import normalize
 
 from igps.data.requirements import Requirements
@@ -12,7 +9,6 @@ from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
 from igps.nn.histograms.base import SampleHistogram, counted, joint
-from igps.retrieval.distances import in_transforms
 from igps.signature.signature import SampleKind
 
 # The weight of a sample is this power of its potential, so that the trunk determines the axes rather than the limbs.
@@ -97,10 +93,7 @@ class AxialHistogram(SampleHistogram):
         total = points.sum() + directions.sum() + potential.sum()
         if not torch.compiler.is_compiling() and not torch.isfinite(total):
             raise ValueError("AxialHistogram: expected finite values, got NaN or infinity.")
-        with (
-            torch.no_grad(),
-            forward_ad._set_fwd_grad_enabled(False) if in_transforms() else nullcontext(),
-        ):
+        with torch.no_grad():
             weights = potential.double().clamp_min(torch.finfo().tiny).pow(_POWER) * mask
             centre, axes = principal_axes(points, weights)
         centre = centre.to(points.dtype)

@@ -11,7 +11,6 @@ from torch.nn import functional
 
 from igps._threads import one_thread
 from igps.data.batch import SignatureBatch
-from igps.retrieval.distances import in_transforms
 
 BLOCK = 2**25
 """Number of entries in a block; enough to keep a GPU busy."""
@@ -23,7 +22,7 @@ _MAX_PADDING, _FREE_PADDING = 0.25, 500
 
 def uses_loops(device: torch.device) -> bool:
     """Whether tensors of a device are processed by compiled loops; otherwise operations of PyTorch are used."""
-    return device.type == "cpu" and not torch.compiler.is_compiling() and not in_transforms()
+    return device.type == "cpu" and not torch.compiler.is_compiling()
 
 
 def map_bodies(

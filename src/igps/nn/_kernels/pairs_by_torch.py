@@ -12,7 +12,6 @@ from torch.utils.checkpoint import checkpoint
 from igps.nn._kernels.batches import BLOCK as _BLOCK
 from igps.nn._kernels.pair_loops import COSINES, DISTANCES, VALUES
 from igps.nn._precision import full_precision
-from igps.retrieval.distances import in_transforms, row_distances
 
 Inputs = Sequence[Tensor]
 
@@ -147,7 +146,7 @@ def _twists(rows: Inputs, columns: Inputs) -> Tensor:
 def _inverse_distances(x: Tensor, y: Tensor) -> Tensor:
     """Return 1 / distance (N, I, J) of points (N, I, D) and (N, J, D), or 0 if they coincide."""
     if x.shape[-1] > 3:  # coordinate by coordinate would be slow
-        squares = row_distances(x, y).square()
+        squares = torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist").square()
     else:
         coordinates = zip(x.unbind(-1), y.unbind(-1), strict=True)
         squares = sum(
@@ -225,7 +224,7 @@ def count_by_torch(
     for first in firsts:
         task = partial(_count_rows, first, first + n_rows, classes, n_classes, pairs)
         # The gradient computes the values of pairs again, as storing them takes much more memory than the points.
-        if torch.is_grad_enabled() and not in_transforms():
+        if torch.is_grad_enabled():
             total = total + checkpoint(task, weights, *clean, use_reentrant=False)
         else:
             total = total + task(weights, *clean)

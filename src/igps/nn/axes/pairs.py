@@ -163,7 +163,7 @@ class EmbeddedPairCosines(_CosineAxes):
     """`PairCosines` of the embedded samples; they depend only on interior distances, and so hardly change with pose.
 
     The direction at an interior sample points to the nearest embedded surface samples; the direction at a surface
-    sample points away from the nearest interior samples. Second derivatives are available only through `torch.func`.
+    sample points away from the nearest interior samples. There are no second derivatives.
     """
 
     def requirements(self, embedding: nn.Module) -> Requirements:
