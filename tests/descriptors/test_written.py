@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from numpy.testing import assert_allclose
 from trimesh.creation import icosphere
 
@@ -16,42 +17,32 @@ from igps.descriptors.with_attributes import WithAttributes
 from igps.fields.volumes.image_attribute import ImageAttribute
 from igps.nn import fit_centres
 from igps.nn.description import describe
+from igps.nn.specification import specification
 from igps.retrieval import chi_square, retrieval_scores
 from label_files import write_nifti
 
 INTERIOR = """
-name: mine
-invariant_to: [motion, scale, pose]
-parts:
-  - eigenpairs: 250
-    axes:
-      - potential: {n_classes: 4}
-      - interior_distance: {n_bins: 64}
+class_path: igps.nn.descriptor.HistogramDescriptor
+init_args:
+  name: mine
+  histograms:
+    class_path: igps.nn.histograms.PairHistogram
+    init_args:
+      axes: [potential, {class_path: igps.nn.axes.InteriorDistance, init_args: {n_bins: 64}}]
+      embedding: {class_path: igps.nn.embedding.SpectralEmbedding, init_args: {n_eigenpairs: 250}}
 """
-
-PRETRAINED = """
-parts:
-  - {samples: surface, eigenpairs: 64, axes: [potential, interior_distance]}
-  - {eigenpairs: 16, n_samples: 1000, axes: [interior_distance: {n_bins: 6, reach: 3.0}, embedded_pair_cosines]}
-  - samples: surface
-    eigenpairs: 50
-    n_samples: 1000
-    axes: [euclidean_distance: {n_bins: 6, reach: 1.0}, pair_cosines]
-  - samples: surface
-    eigenpairs: 50
-    n_samples: 1000
-    axes: [interior_distance: {n_bins: 8, reach: 3.0}, pair_cosines]
-  - {histogram: axial, eigenpairs: 16}
-  - histogram: points
-    eigenpairs: 16
-    axes:
-      - ball_radius: {side: inside, smallest: 0.022, largest: 0.25}
-      - ball_radius: {side: outside, smallest: 0.03, largest: 1.5}
-      - potential: {n_classes: 6, reach: 0.9, eigenpairs: 4, soft: true}
-      - potential: {n_classes: 6, reach: 0.96, soft: true}
-  - {histogram: branches, eigenpairs: 16, n_samples: 1000}
-  - {histogram: pieces, eigenpairs: 16, n_samples: 1000}
-  - {histogram: spectrum, n_eigenpairs: 90}
+PRETRAINED = yaml.safe_dump(specification(pretrained_parts()))
+HEIGHT = """
+class_path: igps.nn.descriptor.HistogramDescriptor
+init_args:
+  name: mine
+  histograms:
+    class_path: igps.nn.histograms.PairHistogram
+    init_args:
+      axes:
+        - {class_path: igps.nn.axes.Attribute, init_args: {name: height, quantiles: 4, soft: true}}
+        - {class_path: igps.nn.axes.InteriorDistance, init_args: {n_bins: 8}}
+      embedding: {class_path: igps.nn.embedding.SpectralEmbedding, init_args: {n_eigenpairs: 20}}
 """
 
 
@@ -83,40 +74,28 @@ def test_a_descriptor_of_the_library_written_down_gives_the_same_numbers(
     found = describe(bodies, own)
     expected = describe(bodies, theirs)
     assert torch.equal(found.flatten(1), expected.flatten(1))
-    assert own.name == "mine"
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
         (
-            "parts: [{axes: [colour]}]",
-            r"axes: expected one of potential, .*, or an attribute with centres.*'colour'",
+            "class_path: os.system\ninit_args: {command: touch hacked}",
+            "'os.system' is no module of igps",
         ),
+        ("class_path: igps.nn.axes.Colour", "igps.nn.axes.Colour is no module of igps"),
+        (INTERIOR.replace("n_bins: 64", "bins: 64"), "unexpected keyword argument 'bins'"),
         (
-            "parts: [{axes: [interior_distance], bins: 4}]",
-            r"pairs: expected axes, samples, .*eigenpairs, got 'bins'",
+            INTERIOR.replace("[potential,", "[colour,"),
+            "axes: expected one of potential, .*'colour'",
         ),
+        (INTERIOR.replace("n_bins: 64", "n_bins: 100000000"), "is too large"),
         (
-            "parts: [{axes: [interior_distance: {bins: 4}]}]",
-            r"interior_distance: expected n_bins, reach.*, got 'bins'",
+            HEIGHT.replace("quantiles: 4", "quantiles: 1"),
+            "expected centres, or at least 2 quantiles",
         ),
-        (
-            "parts: [{histogram: cloud}]",
-            "histogram: expected one of pairs, points, axial, .*, got 'cloud'",
-        ),
-        ("parts: [5]", "histogram: expected one of pairs, .* got '5'"),
-        ("part: []", "a descriptor: expected parts, name, .*, got 'part'"),
-        ("name: x", "expected a list of `parts`"),
-        ("parts: []", "expected at least one in each part"),
-        (
-            "parts: [{axes: [interior_distance: {n_bins: 100000000}]}]",
-            "numbers of at most 10000, got 100000000",
-        ),
-        (
-            "parts: [{axes: [ct: {quantiles: 1}, interior_distance]}]",
-            "ct: expected centres, or at least 2 quantiles",
-        ),
+        ("parts: []", "class_path"),
+        ("5", "'int' object"),
         ("!!python/object/apply:os.system ['touch hacked']", "could not determine a constructor"),
         ("parts: [", "while parsing"),
     ],
@@ -132,7 +111,7 @@ def test_what_is_no_descriptor_is_told_with_what_there_is(tmp_path, text, senten
 def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tmp_path):
     for i in range(2):
         icosphere(subdivisions=2, radius=1 + i).export(tmp_path / f"{i}.off")
-    text = "parts: [{eigenpairs: 20, axes: [height: {quantiles: 4, soft: true}, interior_distance: {n_bins: 8}]}]"
+    text = HEIGHT
     own = igps.descriptor(write(tmp_path, text))
     heights = {"height": lambda body, points: points[:, 2]}
     files = [tmp_path / f"{i}.off" for i in range(2)]

@@ -5,11 +5,11 @@ import os
 from pathlib import Path
 
 import torch
+from torch import nn
 
-from igps.descriptors.from_yaml import load_yaml
 from igps.nn.descriptor import NAME, Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, Head
-from igps.nn.specification import IN_FOLDER, load_module
+from igps.nn.specification import IN_FOLDER, build_module, load_module
 
 _YAML = (".yaml", ".yml")
 
@@ -25,8 +25,8 @@ def is_descriptor_file(path: str | Path) -> bool:
 def load(path: str | Path) -> Descriptor:
     """Load a descriptor from a file or folder, in evaluation mode, with its `card`. No code from the file runs.
 
-    The file was written by `Descriptor.save` or `igps fit`, or is a specification in YAML, see
-    `igps.descriptors.from_yaml`.
+    The file was written by `Descriptor.save` or `igps fit`; or it is YAML, with the `class_path` of each module and its
+    `init_args`, see `igps.nn.specification.specification`.
 
     Example:
         >>> import tempfile
@@ -45,8 +45,9 @@ def load(path: str | Path) -> Descriptor:
         with torch.device("cpu"):
             return load(path).to("meta")
     if str(path).lower().endswith(_YAML):
-        return load_yaml(path)
-    module, card = load_module(path)
+        module, card = _written_module(Path(path)), {}
+    else:
+        module, card = load_module(path)
     if not isinstance(module, Descriptor):
         raise ValueError(f"{path}: expected a descriptor, got {type(module).__name__}.")
     if not NAME.fullmatch(module.name):
@@ -62,6 +63,20 @@ def load(path: str | Path) -> Descriptor:
     if isinstance(scale, int | float) and 0 < scale < math.inf:
         module.scale = scale
     return module
+
+
+def _written_module(path: Path) -> nn.Module:
+    """Return the module that a YAML file specifies, in evaluation mode."""
+    import yaml
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file. Check the path.")
+    try:
+        module = build_module(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError, LookupError, RecursionError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path}: expected a descriptor ({reason}). Correct it.") from error
+    return module.eval()
 
 
 def _check_head(descriptor: Descriptor, head: Head, path: str | Path) -> None:
