@@ -2,8 +2,7 @@
 
 **A hole, or the mouth of a cup?** If a surface is nearly closed, the winding number tells inside from outside (Jacobson
 et al. 2013). A surface is nearly closed if the winding numbers beside its faces deviate on average by less than 1/20
-from whole numbers: bodies with 2 % missing have 0.01 to 0.03, a cup as deep as wide has 0.10. The hidden faces of
-overlapping solids are left out first; otherwise thin bodies would reach 0.10, too.
+from whole numbers: bodies with 2 % missing have 0.01 to 0.03, a cup as deep as wide has 0.10.
 
 In any other surface, an opening is a hole if the largest ball that passes through it has less than half the radius of
 the largest ball behind it; the space behind a hole is inside. A wider opening is the mouth of a cup, a trouser leg or a
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers, Singles
-from igps.mesh.surface import area_vectors, face_areas, signed_volume, unit
+from igps.mesh.surface import area_vectors, face_areas, signed_volume
 
 MARGIN = 3  # cells around the bounding box of the surface
 # Grid points this close to a triangle are wall, which the flood does not enter. A grid line that crosses a triangle has
@@ -31,12 +30,6 @@ _TWO_SIDED = 0.25  # a wall has two sides if the winding number behind the openi
 # A surface is nearly closed below this mean deviation of winding numbers from whole numbers, beside this many faces.
 _NEARLY_CLOSED = 0.05
 _N_PROBES = 1500
-# Number of parts that may be reversed to find the best orientation, and their minimal share of the area.
-_MAX_REVERSED = 8
-_MIN_REVERSED_AREA = 0.01
-# Hidden faces, with the inside on both sides, are removed if they are at least this share and the faces not too many.
-_MIN_HIDDEN = 0.02
-_MAX_FACES_FOR_HIDDEN = 200_000
 _MAX_EXACT_PAIRS = 10**7  # points times faces up to which winding numbers are exact
 
 
@@ -64,33 +57,11 @@ class OrientedSurface:
         faces, part = igl.bfs_orient(faces)
         faces, _ = igl.orient_outward(vertices, faces, part[:, None])
         faces = np.asarray(faces, dtype=np.int64)
-        points = _probe_points(vertices, faces)
-        # The outward side of an open part is a guess. Reversing a part negates its share of the winding numbers: parts
-        # are reversed, one by one, as long as that brings the winding numbers closer to whole numbers.
-        area = np.bincount(part, weights=face_areas(vertices, faces))
-        min_area = _MIN_REVERSED_AREA * area.sum()
-        largest = np.argsort(-area)[:_MAX_REVERSED].tolist()
-        large = [k for k in largest if area[k] > min_area]
-        shares = [cls(vertices, faces[part == k], False).winding(points) for k in large]
-        share_of_small = cls(vertices, faces[~np.isin(part, large)], False).winding(points)
-        total = np.sum([share_of_small, *shares], axis=0)
-        for _ in range(_MAX_REVERSED if len(large) > 1 else 0):
-            reversed_totals = [total - 2 * share for share in shares]
-            best = min(range(len(large)), key=lambda i: _defect(reversed_totals[i]))
-            if _defect(reversed_totals[best]) >= _defect(total) - 1e-3:
-                break
-            total = reversed_totals[best]
-            shares[best] = -shares[best]
-            faces = np.where((part == large[best])[:, None], faces[:, ::-1], faces)
         if signed_volume(vertices, faces) < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
-        surface = cls(vertices, faces, _defect(total) < _NEARLY_CLOSED)
-        is_hidden = total.reshape(2, -1).min(axis=0) > 0.5
-        pays = is_hidden.mean() >= _MIN_HIDDEN and len(faces) <= _MAX_FACES_FOR_HIDDEN
-        if surface.is_nearly_closed or not pays:
-            return surface
-        visible = surface._drop_hidden_faces()
-        return visible if visible.is_nearly_closed else surface
+        surface = cls(vertices, faces, False)
+        defect = _defect(surface.winding(_probe_points(vertices, faces)))
+        return replace(surface, is_nearly_closed=defect < _NEARLY_CLOSED)
 
     @property
     def thickness(self) -> float:
@@ -108,19 +79,6 @@ class OrientedSurface:
         is_exact = len(points) * len(self.faces) <= _MAX_EXACT_PAIRS
         number = igl.winding_number if is_exact else igl.fast_winding_number
         return np.asarray(number(self.vertices, self.faces, points.astype(np.float64)))
-
-    def _drop_hidden_faces(self) -> Self:
-        """Drop the faces with the inside on both sides, such as walls between solids that were put together."""
-        normals = unit(area_vectors(self.vertices, self.faces))
-        middle = self.vertices[self.faces].mean(axis=1)
-        outside = self.winding(middle + 0.25 * normals)
-        inside = self.winding(middle - 0.25 * normals)
-        faces = self.faces[np.minimum(outside, inside) <= 0.5]
-        if not len(faces):
-            return self
-        visible = replace(self, faces=faces)
-        defect = _defect(visible.winding(_probe_points(self.vertices, faces)))
-        return replace(visible, is_nearly_closed=defect < _NEARLY_CLOSED)
 
 
 def _probe_points(vertices: Floats, faces: Integers) -> Floats:
