@@ -3,7 +3,6 @@
 from igps.fields.meshes import (
     archives,
     brains,
-    clouds,
     obj,
     off,
     ply,
@@ -18,7 +17,6 @@ FORMATS = (
     obj.FORMAT,
     ply.FORMAT,
     stl.FORMAT,
-    clouds.FORMAT,
     threemf.FORMAT,
     scenes.GLTF,
     scenes.OTHERS,
