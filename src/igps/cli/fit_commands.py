@@ -55,6 +55,7 @@ def fit(
     """
     from igps.cli.reading import Folder, print_failures, signatures
     from igps.descriptors import descriptor as descriptor_of
+    from igps.descriptors.measures import Measures
     from igps.learning.fitting import check_classes
     from igps.learning.fitting import fit as fit_head
     from igps.nn.description import check_centres
@@ -69,7 +70,14 @@ def fit(
     specification(base)  # raises for a descriptor that cannot be saved, before anything is computed
     check_centres(base)
     folder = Folder(root, labelled=True, check=partial(check_classes, goal=goal))
-    dataset, unread = signatures(folder, [base], n_workers=n_workers, strict=strict, **reading)
+    dataset, unread = signatures(
+        folder,
+        [base],
+        n_workers=n_workers,
+        strict=strict,
+        also=Measures.requirements,
+        **reading,
+    )
     failures: list[Failure] | None = None if strict else []
     model = fit_head(
         dataset,

@@ -49,13 +49,15 @@ def retrieve(
     from igps.cli.reading import Folder, described
     from igps.cli.report_command import check_report_folder
     from igps.cli.report_command import report as write_report
+    from igps.descriptors.measures import Measures
     from igps.retrieval import rerank as reranked_distances
 
     check_report_folder(report, out)
     if report and queries is not None:
         raise ValueError("report: expected no --queries with it: on the page, each body asks.")
     check = partial(_check_scored, queries=queries, needs_scores=out is None)
-    result = described(Folder(root, labelled=True, check=check), descriptor, **describing)
+    folder = Folder(root, labelled=True, check=check)
+    result = described(folder, descriptor, also=Measures.requirements, **describing)
     is_query = check(result.dataset.bodies)
     distances = {"distances": pair_distances(result.descriptor, result.descriptions, progress=True)}
     if rerank:
@@ -130,6 +132,7 @@ def extract(
     from igps.cli.feature_table import SUFFIXES
     from igps.cli.reading import described, files_or_folder, write_mending_notes
     from igps.descriptors import descriptor as descriptor_of
+    from igps.descriptors.measures import Measures
     from igps.descriptors.size_and_side import SizeAndSide
     from igps.nn.descriptor import EmbeddedDescriptor
 
@@ -144,7 +147,8 @@ def extract(
         raise ValueError(
             f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}."
         )
-    result = described(files_or_folder(meshes), descriptor, **describing)
+    also = None if is_archive else Measures.requirements
+    result = described(files_or_folder(meshes), descriptor, also=also, **describing)
     out.parent.mkdir(parents=True, exist_ok=True)
     if is_archive:
         _write_archive(out, result, short)

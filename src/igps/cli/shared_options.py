@@ -77,6 +77,7 @@ _SIGNATURE_HELP = {
     "accuracy": "largest relative error of 99 percent of the interior distances; none for exact distances",
     "attributes": "values to compute at the samples",
     "seed": "seed of the surface samples and of the eigensolver",
+    "measures": "also compute plain numbers, for commands that do not print them",
     "least_vertices": "subdivide meshes with fewer vertices; by default two more than the eigenpairs",
 }
 

@@ -21,11 +21,13 @@ from igps.signature.signature import SAMPLE_KINDS, Samples, Signature, Signature
 
 logger = logging.getLogger(__name__)
 
-Kind = Literal["surface", "signature", "attribute", "description", "failure", "listing", "picture"]
+Kind = Literal[
+    "surface", "signature", "attribute", "description", "failure", "listing", "picture", "measure"
+]
 
 _FORMAT = "igps-cache-3"
 # Fields of a Signature besides arrays and configuration
-_SCALAR_FIELDS = ("area", "volume", "name", "notes", "residual", "unit", "measures")
+_SCALAR_FIELDS = ("area", "volume", "name", "notes", "residual", "unit")
 # Seconds until a partial file is removed; writing a file takes well below one second
 _ABANDONED_AGE = 24 * 3600
 _CHECKSUM_ROW = 4096  # bytes of a row of the matrix whose column sums enter a checksum

@@ -15,7 +15,7 @@ class CacheHit:
     attributes: Mapping[str, str] = field(default_factory=dict)  # keys of added attributes, by name
     notes: tuple[str, ...] = ()  # on how the mesh was changed
     unit: str | None = None  # of length
-    measures: Mapping[str, float] = field(default_factory=dict)  # plain numbers, by name
+    measures: Mapping[str, float] = field(default_factory=dict)  # plain numbers by name
 
     @property
     def whole_key(self) -> str:
@@ -25,10 +25,9 @@ class CacheHit:
         return derived_key("with attributes", self.key, sorted(self.attributes.items()))
 
     def with_header(self, texts: Mapping[str, str]) -> "CacheHit":
-        """Return the entry with notes, unit and measures from the texts of the Signature's file."""
+        """Return the entry with notes and unit from the texts of the Signature's file."""
         return replace(
             self,
             notes=tuple(json.loads(texts["notes"])),
             unit=json.loads(texts["unit"]),
-            measures=json.loads(texts["measures"]),
         )

@@ -222,8 +222,22 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return [None if header is None else header.unit for header in self._headers()]
 
     def measures(self) -> list[Mapping[str, float]]:
-        """Return the plain numbers of each body by name, see `igps.measures`; none without a cached Signature."""
+        """Return the plain numbers of each body by name, see `igps.measures`.
+
+        A body has none without a cached Signature, or if neither the configuration nor the descriptor asks for them.
+        """
         return [{} if header is None else header.measures for header in self._headers()]
+
+    def measured(self, n_workers: int | None = None) -> Self:
+        """Return the dataset with plain numbers in its Signatures, computed by `n_workers` where they are missing."""
+        if self.config.measures or self._loaded is not None:
+            return self
+        dataset = copy.copy(self)
+        dataset.config = replace(self.config, measures=True)
+        dataset.pipeline = replace(self.pipeline, config=dataset.config)
+        dataset._hits = (None,) * len(self)
+        dataset.precompute(n_workers=n_workers, progress=False)
+        return dataset
 
     def _headers(self) -> Sequence[Signature | CacheHit | None]:
         """Return what holds the notes, the unit and the measures of each body; None if that is not known."""

@@ -1,9 +1,9 @@
 """Identities: the content of files, the key of a Signature, and the keys of all that is made from it.
 
 The key of a Signature is the hash of everything that it depends on: the content of its files, the number of a label or
-the name of another body, the load options, the configuration, and the versions of mending, of the measures and of the
-algorithm. Whatever is made from a Signature (an attribute, a transformed Signature, a description) has the hash of that
-key and of its own parameters as key, see `derived_key`.
+the name of another body, the load options, the configuration, and the versions of mending and of the algorithm. What is
+made from a Signature (its plain numbers, an attribute, a transformed Signature, a description) has the hash of that key
+and of its own parameters as key, see `derived_key`.
 """
 
 import hashlib
@@ -18,7 +18,6 @@ from igps.mesh.mending import MENDING_VERSION
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.signature.config import SignatureConfig
-from igps.signature.measures import MEASURES_VERSION
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,6 @@ def _parameters(
         "number": number,
         "reading": reading.as_dict(),
         "mending": MENDING_VERSION,
-        "measures": MEASURES_VERSION,
         "config": parameters,
     }
     return json.dumps(fields, sort_keys=True).encode()

@@ -1,6 +1,7 @@
 """Pipeline from the file of a body to its cached Signature, in this process or in a worker."""
 
 import importlib.metadata
+import json
 import logging
 import socket
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,6 +26,7 @@ from igps.mesh.loading import BodyRef, each_surface, read_surface, surface_body
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.mesh.raw_body import RawBody
+from igps.signature.measures import MEASURES_VERSION, measures
 from igps.signature.signature import (
     SAMPLE_KINDS,
     SampleKind,
@@ -69,7 +71,7 @@ class SignaturePipeline:
             )
 
     def cache(self, kind: Kind) -> Cache:
-        """Return the cache of Signatures, attributes, descriptions or failures."""
+        """Return the cache of a kind of records."""
         return Cache(self.cache_dir, kind)
 
     @one_thread()
@@ -145,12 +147,13 @@ class SignaturePipeline:
         except MeshError:  # a missing file of an attribute, which the computation reports
             return None
         texts = self.cache("signature").texts(keys.key)
-        if texts is None:
+        numbers = self._known_measures(body, content)
+        if texts is None or numbers is None:
             return self._known_failure(body, content)
         attributes = self.cache("attribute")
         if not all(key in attributes for key in keys.attributes.values()):
             return None
-        return keys.with_header(texts)
+        return replace(keys.with_header(texts), measures=numbers)
 
     def read(self, hit: CacheHit) -> Signature | None:
         """Read the Signature of a cache entry; None if it is no longer in the cache."""
@@ -162,7 +165,7 @@ class SignaturePipeline:
             if values is None:
                 return None
             signature = with_attribute(signature, name, values)
-        return signature
+        return replace(signature, measures=hit.measures)
 
     def signature(self, body: BodyRef) -> Signature:
         """Return the Signature of a body from the cache, where it is stored if it was missing."""
@@ -266,20 +269,37 @@ class SignaturePipeline:
         self, body: BodyRef, content: Content, key: str, mesh: Mesh | None
     ) -> Signature:
         """Return the Signature of a body before attributes and transform, computed into the cache if missing."""
-        cache = self.cache("signature")
-        signature = cache.get(key, decode)
-        if signature is not None:
-            return signature
+        signature = self.cache("signature").get(key, decode)
+        numbers = self._known_measures(body, content)
+        if signature is not None and numbers is not None:
+            return replace(signature, measures=numbers)
         config = None  # on which reading does not depend
         try:
             mesh = self.mesh(body, content) if mesh is None else mesh
             config = self.config
-            signature = compute_signature(mesh, config)
+            if signature is None:
+                signature = compute_signature(mesh, replace(config, measures=False))
+                self.put("signature", key, encode(signature))
+            if numbers is None:
+                numbered = mesh.numbered_by_faces()  # on which rounding depends
+                numbers = measures(numbered, signature.interior.points)
+                texts = {"measures": json.dumps(numbers)}
+                self.put("measure", self._measures_key(body, content), Record({}, texts))
         except MeshError as error:
             self.remember(body, content, error, config)
             raise
-        self.put("signature", key, encode(signature))
-        return signature
+        return replace(signature, measures=numbers)
+
+    def _known_measures(self, body: BodyRef, content: Content) -> Mapping[str, float] | None:
+        """Return the plain numbers of a body; none if they are not asked for, None if they are not in the cache."""
+        if not self.config.measures:
+            return {}
+        key = self._measures_key(body, content)
+        return self.cache("measure").get(key, lambda record: json.loads(record.texts["measures"]))
+
+    def _measures_key(self, body: BodyRef, content: Content) -> str:
+        key = signature_key(content, body, self.reading, self.config)
+        return derived_key("measure", key, MEASURES_VERSION)
 
     def _attribute(
         self, body: BodyRef, signature: Signature, name: str, key: str

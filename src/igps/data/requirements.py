@@ -24,6 +24,7 @@ class Requirements:
     mesh: bool = False  # whether the mesh is needed
     eigenpairs: bool = True  # whether any are needed, and not plain numbers or samples alone
     samples: tuple[SampleKind, ...] = SAMPLE_KINDS  # kinds of samples that are read
+    measures: bool = False  # whether plain numbers are needed, see `igps.measures`
     # Whether all eigenpairs are used, so that more would give another descriptor
     whole_spectrum: bool = False
     # Sources of additional attributes by name, which the `attributes` of a SignatureDataset override
@@ -37,22 +38,25 @@ class Requirements:
             mesh=self.mesh or other.mesh,
             eigenpairs=self.eigenpairs or other.eigenpairs,
             samples=tuple(k for k in SAMPLE_KINDS if k in (*self.samples, *other.samples)),
+            measures=self.measures or other.measures,
             whole_spectrum=self.whole_spectrum or other.whole_spectrum,
             sources={**self.sources, **other.sources},
         )
 
     def apply_to(self, config: SignatureConfig) -> SignatureConfig:
-        """Return the configuration with the required attributes, and the required number of eigenpairs if it has none.
+        """Return the configuration with the required attributes and plain numbers.
 
-        For a whole spectrum, the number is at least the default. A ValueError is raised if the configuration has fewer.
+        If it has no number of eigenpairs, it gets the required one, for a whole spectrum at least the default. A
+        ValueError is raised if the configuration has fewer.
         """
         default = SignatureConfig.DEFAULT_EIGENPAIRS if self.whole_spectrum else 0
         if config.n_eigenpairs is None and not self.eigenpairs:
             config = replace(config, n_eigenpairs=0)
         config = config.with_eigenpairs(max(default, self.n_eigenpairs))
         self._check_eigenpairs(config.n_kept)
+        attributes = dict.fromkeys((*config.attributes, *self.attributes))
         return replace(
-            config, attributes=tuple(dict.fromkeys((*config.attributes, *self.attributes)))
+            config, attributes=tuple(attributes), measures=config.measures or self.measures
         )
 
     def check_config(self, config: SignatureConfig) -> None:

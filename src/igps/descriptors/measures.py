@@ -48,7 +48,7 @@ class Measures(Descriptor):
     """
 
     source = "Zwanenburg et al. 2020 (IBSI); Hildebrand and Rüegsegger 1997"
-    requirements = Requirements(eigenpairs=False, samples=())
+    requirements = Requirements(eigenpairs=False, samples=(), measures=True)
     spread: Tensor
     fitted: Tensor
 
@@ -66,7 +66,8 @@ class Measures(Descriptor):
         """(N, D) logarithms over their spread; a ValueError if the bodies have no measures."""
         if batch.measures is None:
             raise ValueError(
-                "measures: expected bodies with plain numbers, got Signatures without them. Compute these from meshes."
+                "measures: expected bodies with plain numbers, got Signatures without them. Give "
+                "SignatureDataset(descriptor=...) this descriptor, or SignatureConfig(measures=True)."
             )
         units = batch.units or (None,) * len(batch)
         return (self.logarithms(batch.measures, units) / self.spread).float()

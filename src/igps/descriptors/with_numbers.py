@@ -54,7 +54,7 @@ class WithNumbers(Descriptor):
         self.name = f"{descriptor.name}_numbers"
         self.source = f"{descriptor.source}; {self.numbers.source}"
         self.invariant_to = tuple(x for x in descriptor.invariant_to if x == "motion")
-        self.requirements = descriptor.requirements
+        self.requirements = descriptor.requirements | self.numbers.requirements
 
     @property
     def n_features(self) -> int:

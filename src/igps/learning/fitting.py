@@ -135,6 +135,7 @@ def fit(
     base = copy.deepcopy(base)  # the caller's descriptor stays unchanged
     metric = metric if prior else None
     options = {"n_workers": n_workers, "progress": progress}
+    dataset = dataset.measured(n_workers)
     histograms, dataset = _histograms(dataset, base, failures, **options)
     rows = torch.cat([histograms, _numbers(dataset)], dim=1)
     check_classes(dataset.bodies, goal)  # without the bodies that could not be described

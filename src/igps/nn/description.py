@@ -76,8 +76,7 @@ def describe(
         MeshError: a mesh cannot be described and `failures` is None, or no mesh can be described.
         ValueError: the Signatures lack what the descriptor needs, or there is no mesh.
     """
-    if isinstance(descriptor, Descriptor):
-        descriptor.requirements.check_config(dataset.config)
+    dataset = _with_required(dataset, descriptor, n_workers)
     if not isinstance(descriptor, nn.Module):
         remedy = (
             f"igps.descriptor({descriptor!r})" if isinstance(descriptor, str) else "a Descriptor"
@@ -119,6 +118,16 @@ def describe(
     return torch.from_numpy(np.stack([descriptions[i] for i in sorted(descriptions)]))
 
 
+def _with_required(
+    dataset: SignatureDataset, descriptor: nn.Module, n_workers: int | None
+) -> SignatureDataset:
+    """Return the dataset with plain numbers if the descriptor needs them; raise a ValueError if it lacks the rest."""
+    if not isinstance(descriptor, Descriptor):
+        return dataset
+    descriptor.requirements.check_config(dataset.config)
+    return dataset.measured(n_workers) if descriptor.requirements.measures else dataset
+
+
 def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
     """Fit the centres of quantile axes to the samples of a collection, and return whether anything was fitted.
 
@@ -136,9 +145,10 @@ def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
             samples.append(signature.interior.attributes[axis.name][:500])
     for axis, samples in zip(axes, values, strict=True):
         axis.fit(torch.from_numpy(np.concatenate(samples)))
-    is_fitted = isinstance(descriptor, Descriptor) and descriptor.fit_collection(
-        dataset.measures(), dataset.units()
-    )
+    is_fitted = False
+    if isinstance(descriptor, Descriptor) and descriptor.requirements.measures:
+        numbers = dataset.measured().measures()
+        is_fitted = descriptor.fit_collection(numbers, dataset.units())
     return bool(axes) or is_fitted
 
 

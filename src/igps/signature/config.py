@@ -38,6 +38,7 @@ class SignatureConfig:
         attributes: attributes of the samples: "depth" and "electrostatic_potential" (interior only; of a uniform charge
             on the surface, so of the form alone) and "surface_direction", see `interior_attributes`.
         seed: seed of the surface samples and of the eigensolver's start vectors.
+        measures: whether the plain numbers of `igps.measures` are computed, too; samples do not depend on them.
         least_vertices: meshes with fewer vertices are subdivided when they are read, unless `mend` is "never"; None for
             two more than the number of eigenpairs, the fewest from which these can be computed.
     """
@@ -56,6 +57,7 @@ class SignatureConfig:
     accuracy: float | None = 1e-3
     attributes: tuple[AttributeName, ...] = ()
     seed: int = 0
+    measures: bool = False
     least_vertices: int | None = None
 
     def __post_init__(self) -> None:
@@ -112,12 +114,16 @@ class SignatureConfig:
         return replace(self, n_eigenpairs=n_computed, least_vertices=self.n_vertices_read)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the parameters and the algorithm's version by name, without `least_vertices` if it has its default."""
+        """Return what samples and eigenpairs depend on: the parameters and the algorithm's version, by name.
+
+        `measures` is left out, and so is `least_vertices` if it has its default.
+        """
         parameters = {
             **asdict(self),
             "n_eigenpairs": self.n_kept,
             "algorithm_version": self.ALGORITHM_VERSION,
         }
+        del parameters["measures"]
         if self.n_vertices_read == self.n_kept + 2:
             del parameters["least_vertices"]
         return parameters

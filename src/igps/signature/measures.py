@@ -20,7 +20,7 @@ from igps.mesh.surface import area_vectors, components, directed_edges, undirect
 from igps.signature.voxels import interior_samples
 
 MEASURES_VERSION = 8
-"""Part of every cache key: raise it whenever the same mesh would give other numbers."""
+"""Part of the cache keys of plain numbers: raise it whenever the same mesh would give other numbers."""
 
 POWERS: Mapping[str, int] = {
     "voxel_volume": 3,
@@ -233,6 +233,9 @@ class _Balls:
 
 def _even_selection(points: Floats) -> Floats:
     """Return every n-th point by its distance from the middle, so that a turned grid gives the same selection."""
+    points = points[
+        np.lexsort(points.T[::-1])
+    ]  # as on their grid, whatever their order in a Signature
     every = math.ceil(len(points) / _N_THICKNESS_POINTS)
     return points[_from_the_middle(points)[every // 2 :: every]]
 

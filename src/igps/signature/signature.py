@@ -127,7 +127,7 @@ class Signature:
         notes: changes made to the mesh, and fallbacks of the computation, in words.
         residual: largest residual of the eigenpairs, relative to the eigenvalue; NaN if unknown.
         unit: of length, such as "mm"; None if unknown.
-        measures: plain numbers by name, see `igps.measures`; none if it was not computed from a mesh.
+        measures: plain numbers by name, see `igps.measures`; none if the configuration does not ask for them.
     """
 
     eigenvalues: Floats
@@ -181,6 +181,7 @@ def compute_signature(
     """
     config = (config or SignatureConfig()).resolved()
     mesh = as_mesh(mesh).numbered_by_faces()  # rounding depends on the numbering
+    whole = mesh
     if config.max_vertices is not None:
         mesh = simplify(mesh, config.max_vertices)
     outer, is_outer = mesh.outer()
@@ -190,8 +191,9 @@ def compute_signature(
             f"{len(outer.vertices)}. Subdivide the mesh or lower n_eigenpairs."
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
+    numbers = measures(whole, points) if config.measures else {}
     if config.n_kept == 0:
-        return _without_eigenpairs(mesh, points, config)
+        return _without_eigenpairs(mesh, points, config, numbers)
     spectrum, notes = _spectrum(outer, config)
     eigenvalues = spectrum.eigenvalues
     functions = spectrum.eigenfunctions
@@ -225,11 +227,13 @@ def compute_signature(
         notes=(*mesh.notes, *notes),
         residual=residual,
         unit=mesh.unit,
-        measures=measures(mesh, points),
+        measures=numbers,
     )
 
 
-def _without_eigenpairs(mesh: Mesh, points: Floats, config: SignatureConfig) -> Signature:
+def _without_eigenpairs(
+    mesh: Mesh, points: Floats, config: SignatureConfig, numbers: Mapping[str, float]
+) -> Signature:
     """Return samples, attributes and plain numbers alone."""
     keys = spatial_ordering_keys(mesh)
     surface = surface_points(mesh, config.n_surface_samples, config.seed, keys)
@@ -247,7 +251,7 @@ def _without_eigenpairs(mesh: Mesh, points: Floats, config: SignatureConfig) -> 
         mesh.name,
         notes=mesh.notes,
         unit=mesh.unit,
-        measures=measures(mesh, points),
+        measures=numbers,
     )
 
 
