@@ -318,17 +318,6 @@ def test_a_cloud_of_points_is_told_from_a_surface(tmp_path):
         load_mesh(tmp_path / "cloud.obj")
 
 
-def test_a_format_without_its_module_says_which_extra_has_it(tmp_path, monkeypatch):
-    (tmp_path / "part.dae").write_bytes(b"<COLLADA/>")
-
-    def missing(*_, **__):
-        raise ImportError("No module named 'collada'")
-
-    monkeypatch.setattr(trimesh, "load_scene", missing)
-    with pytest.raises(MeshError, match=r"part\.dae.*collada.*interior-gps\[formats\]"):
-        load_mesh(tmp_path / "part.dae")
-
-
 @pytest.mark.parametrize("where", ["far", "far in double precision", "at the origin"])
 def test_places_that_single_precision_rounds_off_are_told(where, tmp_path):
     """In coordinates of maps an object of some metres has steps of half a metre, which bend its surface."""
