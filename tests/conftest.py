@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,8 +20,19 @@ from page_packages import install
 
 # The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
 torch.set_num_threads(1)
-threadpool_limits(1, "blas")  # of libraries that are loaded already, others heed the variable
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def set_blas_threads(number):
+    """Of libraries that are loaded already: others heed the variable.
+
+    As long as the thread that set a number lives, threadpoolctl heeds no other, so one sets it that ends.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(threadpool_limits, number, "blas").result()
+
+
+set_blas_threads(1)
 
 SHARED = Path(__file__).parents[2] / "shared"
 

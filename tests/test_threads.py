@@ -10,12 +10,12 @@ import pytest
 import torch
 from numpy.testing import assert_array_equal
 from pytorch_lightning import Trainer
-from threadpoolctl import threadpool_info, threadpool_limits
+from threadpoolctl import threadpool_info
 from torch.utils.data import DataLoader
 
 import igps
 from commands import error_of
-from conftest import torch_threads
+from conftest import set_blas_threads, torch_threads
 from igps._parallel import on_threads
 from igps._threads import Team, n_cores, n_threads, one_thread
 from igps.data.batch import LabelledSignature
@@ -47,8 +47,10 @@ def settings():
 @pytest.fixture(autouse=True)
 def three_threads():
     """An unusual number, so that what restores another is seen."""
-    with torch_threads(3), threadpool_limits(3, "blas"):
+    set_blas_threads(3)
+    with torch_threads(3):
         yield
+    set_blas_threads(1)
 
 
 def seen_cores():
