@@ -60,7 +60,7 @@ def write_unusable(folder):
         "nothing.off": "OFF\n0 0 0\n",
         "triangle.off": "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
         "line.obj": "v 0 0 0\nv 1 2 3\nv 2 4 6\nv 3 6 9\nf 1 2 3\nf 2 3 4\n",
-        "points.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv 1 1 1\n",
+        "five.xyz": "0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 1 1\n",
         "part.dae": "<COLLADA/>",
     }
     for name, text in texts.items():
@@ -71,7 +71,7 @@ def write_unusable(folder):
         "nothing.off": "the file is empty: no vertices and no faces. Export it again.",
         "triangle.off": "expected a closed surface, got a single triangle. Export it again.",
         "line.obj": "expected a surface, but no triangle has an area. Give lines some thickness.",
-        "points.obj": "no faces. A surface is needed: mesh a point cloud in another program first.",
+        "five.xyz": "expected at least 10 points for a surface, got 5. Export or scan more.",
         "part.dae": "COLLADA, 3DXML or XAML needs a module that is not installed (No module named 'collada'). "
         'Install it: pip install "interior-gps[formats]"; or convert the file to OFF, OBJ, PLY or STL.',
     }

@@ -95,7 +95,7 @@ def test_what_cannot_be_used_costs_the_others_nothing(tmp_path, monkeypatch):
         assert found[name].seconds is None
         assert found[name].n_vertices_after is None
     # Some can be read at least.
-    known = {"triangle.off": 3, "line.obj": 4, "points.obj": 5, "empty.off": None}
+    known = {"triangle.off": 3, "line.obj": 4, "five.xyz": 5, "empty.off": None}
     for name, n_vertices in known.items():
         assert found[name].n_vertices == n_vertices
 

@@ -160,6 +160,11 @@ def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path):
     text += "".join("f {} {} {}\n".format(*face) for face in (whole.faces + 1).tolist())
     (tmp_path / "boxes.obj").write_text(text)
     assert parts(tmp_path / "boxes.obj", PIECES) == ["piece 1", "piece 2", "piece 3"]
+    np.savetxt(
+        tmp_path / "cloud.xyz",
+        np.random.default_rng(0).random((20, 3)),
+    )
+    assert parts(tmp_path / "cloud.xyz", PIECES) == [None]
 
 
 def test_one_bad_body_does_not_cost_the_others(tmp_path, caplog):

@@ -1,4 +1,4 @@
-"""Meshes from files: formats, mending, and what makes a file unusable."""
+"""Meshes from files: formats, clouds of points, mending, and what makes a file unusable."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_missing_and_unreadable_files(tmp_path):
             load_mesh(tmp_path / name)
 
 
-@pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl", "glb", "3mf"])
+@pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl", "glb", "xyz", "3mf"])
 def test_an_empty_file_is_called_empty(tmp_path, suffix):
     (tmp_path / f"none.{suffix}").write_bytes(b"")
     with pytest.raises(
@@ -74,6 +74,10 @@ def test_comments_may_be_in_any_encoding(tmp_path, suffix, comment, encoding):
     mesh = load_mesh(path)
     assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
     assert_array_equal(mesh.faces, surface.faces)
+    (tmp_path / "cloud.xyz").write_bytes(f"# {words}\n0 0 1\n0 1 0\n".encode(encoding))
+    cloud = read_surface(tmp_path / "cloud.xyz")
+    expected = [[0, 0, 1], [0, 1, 0]]
+    assert cloud.vertices.tolist() == expected
 
 
 def test_a_byte_order_mark_costs_no_vertex(tmp_path):
@@ -311,11 +315,34 @@ def test_unknown_way_to_mend_is_refused():
         LoadOptions(mend="please")
 
 
-def test_a_cloud_of_points_is_told_from_a_surface(tmp_path):
-    rows = "\n".join("v {} {} {}".format(*place) for place in icosphere().vertices.tolist())
-    (tmp_path / "cloud.obj").write_text(rows)
-    with pytest.raises(MeshError, match=r"cloud\.obj: no faces.*mesh a point cloud"):
-        load_mesh(tmp_path / "cloud.obj")
+@pytest.mark.parametrize(
+    ("suffix", "normals"),
+    [("xyz", False), ("ply", True)],
+)
+def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(tmp_path, suffix, normals):
+    surface = icosphere(subdivisions=4)
+    rows = np.asarray(surface.vertices) * [1, 0.8, 1.3]
+    names = ["x", "y", "z"]
+    if normals:
+        rows = np.hstack([rows, surface.vertex_normals])
+        names = [*names, "nx", "ny", "nz"]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(rows)}",
+        *(f"property float {n}" for n in names),
+    ]
+    lines = [*header, "end_header"] if suffix == "ply" else []
+    lines += [" ".join(f"{x:.7f}" for x in row) for row in rows]
+    path = tmp_path / f"cloud.{suffix}"
+    path.write_text("\n".join(lines) + "\n")
+    mesh = load_mesh(path)
+    expected = pytest.approx(4 / 3 * np.pi * 1.04, rel=0.02)
+    assert mesh.volume == expected
+    assert mesh.genus == 0
+    assert any("watertight" in note for note in mesh.notes)
+    with pytest.raises(MeshError, match=r"cloud.*no faces"):
+        load_mesh(path, LoadOptions("never"))
 
 
 @pytest.mark.parametrize("where", ["far", "far in double precision", "at the origin"])

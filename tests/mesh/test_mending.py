@@ -274,9 +274,13 @@ UNUSABLE = {
         "no triangle has an area",
     ),
     "point": (lambda: (np.ones((4, 3)), np.array([[0, 1, 2], [1, 2, 3]])), "in one point"),
-    "points": (
-        lambda: (default_rng(0).random((50, 3)), np.zeros((0, 3), dtype=int)),
-        "no faces",
+    "five": (
+        lambda: (default_rng(0).random((5, 3)), None),
+        "expected at least 10 points for a surface, got 5",
+    ),
+    "line of points": (
+        lambda: (np.outer(np.linspace(0, 1, 30), [1, 2, 3]).astype(np.float32) + 5, None),
+        "all 30 points lie on one line",
     ),
     "huge": (
         lambda: (1e200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])),
@@ -286,7 +290,12 @@ UNUSABLE = {
         lambda: (1e-200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])),
         "from 1e-30 to 1e\\+30",
     ),
+    "tiny cloud": (
+        lambda: (1e-200 * default_rng(0).random((400, 3)), None),
+        "from 1e-30 to 1e\\+30",
+    ),
     "nan": (lambda: (np.full((4, 3), np.nan), np.array([[0, 1, 2], [1, 2, 3]])), "NaN"),
+    "nan cloud": (lambda: (np.full((40, 3), np.nan), None), "NaN"),
     "out of range": (lambda: (np.eye(3), np.array([[0, 1, 9], [0, 1, 2]])), "out of range"),
 }
 

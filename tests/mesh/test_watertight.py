@@ -311,6 +311,35 @@ def test_wires_stay_in_one_piece():
     assert_allclose(found, expected, atol=0.08)
 
 
+@pytest.mark.parametrize("with_normals", [True, False])
+def test_point_clouds(with_normals):
+    points = default_rng(0).standard_normal((6000, 3))
+    points /= norm(points, axis=1, keepdims=True)
+    body = watertight(points, normals=points if with_normals else None, resolution=64)
+    assert_closed(body)
+    assert body.volume == pytest.approx(BALL, rel=0.03)
+
+
+def test_flat_places_have_a_delaunay_triangulation():
+    body = watertight(
+        *arrays(box((1, 1, 0.6))),
+        resolution=48,
+        max_vertices=500,
+    )
+    assert_closed(body)
+    opposite = {}
+    for face in body.faces.tolist():
+        for i in range(3):
+            corner = face[i - 1]
+            u, v = (body.vertices[face[k]] - body.vertices[corner] for k in (i, (i + 1) % 3))
+            cosine = u @ v / norm(u) / norm(v)
+            opposite[face[i], face[(i + 1) % 3]] = np.arccos(np.clip(cosine, -1, 1))
+    sums = np.array([angle + opposite[b, a] for (a, b), angle in opposite.items()])
+    # All but a few along the box's edges, where the surface bends.
+    assert (sums > np.pi + 2e-3).mean() < 0.02
+    assert sums.max() < 2 * np.pi - 1e-3
+
+
 def test_follows_the_surface_when_it_is_moved_and_scaled():
     vertices, faces = arrays(torus(1.0, 0.3))
     body = watertight(vertices, faces, resolution=64)
@@ -349,6 +378,10 @@ def test_what_is_no_surface_is_refused():
         watertight(
             np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]]), name="line.obj"
         )
+    with pytest.raises(
+        MeshError, match=r"five\.xyz: expected at least 10 points for a surface, got 5"
+    ):
+        watertight(default_rng(0).random((5, 3)), name="five.xyz")
     with pytest.raises(MeshError, match="finite"):
         watertight(
             np.full((3, 3), np.nan),

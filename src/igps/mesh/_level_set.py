@@ -47,7 +47,9 @@ class Grid:
         return points * self.cell + self.origin
 
 
-def cell_sizes(vertices: Floats, faces: Integers, resolution: int) -> tuple[float, float]:
+def cell_sizes(
+    vertices: Floats, faces: Integers, resolution: int, spacing: float
+) -> tuple[float, float]:
     """Return the default and the minimal size of a cell, which differ only for long bodies.
 
     With the minimal size the grid has about as many cells, in all and on the surface, as a cube of side `resolution`.
@@ -61,6 +63,7 @@ def cell_sizes(vertices: Floats, faces: Integers, resolution: int) -> tuple[floa
     by_volume = volume ** (1 / 3) / resolution
     by_area = float(np.sqrt(area / (6 * resolution**2)))
     min_size = min(max(by_volume, by_area), longest / (0.8 * resolution))
+    min_size = max(min_size, spacing)
     default_size = max(min_size, longest / (2 * resolution))
     return default_size, min_size
 

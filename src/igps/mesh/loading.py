@@ -61,7 +61,7 @@ def load_mesh(
     part: str | None = None,
     least_vertices: int = 0,
 ) -> Mesh:
-    """Read a mesh, a label volume or a molecule, and make a body of it.
+    """Read a mesh, a point cloud, a label volume or a molecule, and make a body of it.
 
     Polygons are cut into triangles. Vertices keep their order and are not merged. In an STL file, which has no shared
     vertices, coincident corners become one vertex.
@@ -197,6 +197,7 @@ def surface_body(
         faces,
         how=options.mend,
         least_vertices=least_vertices,
+        normals=raw.normals,
         cavities=options.cavities,
         name=name,
     )
@@ -211,14 +212,17 @@ def surface_body(
 def _with_coordinates(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, list[str]]:
     """Drop a few vertices that are not finite, with their faces; or return all if they are more than a sliver."""
     is_lost: Booleans = np.asarray(~np.isfinite(vertices).all(axis=1))
-    is_valid = len(faces) > 0 and faces.min() >= 0 and faces.max() < len(vertices)
+    is_valid = len(faces) == 0 or (faces.min() >= 0 and faces.max() < len(vertices))
     if not is_lost.any() or not is_valid:
         return vertices, faces, []
     has_lost = is_lost[faces].any(axis=1)
-    if has_lost.mean() > _MAX_LOST:
+    share = has_lost.mean() if len(faces) else is_lost.mean()
+    if share > _MAX_LOST:
         return vertices, faces, []
     n_lost = counted(int(is_lost.sum()), "vertex")
     note = f"dropped {n_lost} without coordinates and {counted(int(has_lost.sum()), 'face')}"
+    if not len(faces):
+        return vertices[~is_lost], faces, [note]
     return *compact(vertices, faces[~has_lost]), [note]
 
 

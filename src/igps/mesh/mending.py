@@ -24,7 +24,7 @@ from igps.mesh._tidying import (
 )
 from igps.mesh._union import unite_parts
 from igps.mesh.errors import MeshError
-from igps.mesh.mesh import Mesh, check_arrays, check_size
+from igps.mesh.mesh import Mesh, check_arrays, check_coordinates, check_size
 from igps.mesh.options import Cavities, Mending
 from igps.mesh.simplification import subdivide
 from igps.mesh.surface import signed_volume
@@ -52,10 +52,11 @@ _MAX_SHELL = 0.5
 
 def mend(
     vertices: Floats,
-    faces: Integers,
+    faces: Integers | None,
     *,
     how: Mending = "auto",
     least_vertices: int = 0,
+    normals: Floats | None = None,
     cavities: Cavities = "fill",
     name: str = "mesh",
 ) -> Mesh:
@@ -68,10 +69,11 @@ def mend(
 
     Args:
         vertices: (V, 3) positions, any length unit.
-        faces: (F, 3) vertex indices.
+        faces: (F, 3) vertex indices; None or empty for a point cloud, which is made watertight.
         how: "auto": as above. "never": accept bodies only. "always": make every surface watertight that, after welding,
             does not bound one body or intersects itself; "auto" does not check for intersections.
         least_vertices: minimal number of vertices, such as the number of eigenpairs plus two; ignored with "never".
+        normals: (V, 3) normals of a point cloud, if known.
         cavities: "fill" drops closed parts inside the body. "keep" makes them the surfaces of hollows, unless the body
             is made watertight.
         name: name of the surface in error messages, usually its file.
@@ -82,24 +84,32 @@ def mend(
     check_one_of(get_args(Mending), how=how)
     if how == "never":
         return Mesh(vertices, np.asarray(faces), name=name, cavities=cavities == "keep")
-    if np.size(vertices) == 0:
-        raise MeshError(f"{name}: the file is empty: no vertices and no faces. Export it again.")
-    check_arrays(vertices, faces, name)
-    vertices = np.asarray(vertices, dtype=np.float64)
-    triangles = np.asarray(faces, dtype=np.int64)
-    if len(triangles) == 1:
-        raise MeshError(
-            f"{name}: expected a closed surface, got a single triangle. Export it again."
-        )
-    corners = vertices[triangles]
-    if (corners == corners[:, :1]).all():
-        raise MeshError(
-            f"{name}: expected a surface, but all faces lie in one point. Check the file."
-        )
-    check_size(corners.reshape(-1, 3), name)  # before squares of lengths overflow or vanish
-    mending = _Mending(name, cavities == "keep")
-    repair = mending.remade if how == "always" else mending.mended
-    mesh = repair(vertices, triangles)
+    if faces is None or np.size(faces) == 0:
+        vertices = np.asarray(vertices, dtype=np.float64)
+        if vertices.size == 0:
+            raise MeshError(
+                f"{name}: the file is empty: no vertices and no faces. Export it again."
+            )
+        check_coordinates(vertices, name)
+        check_size(vertices, name)
+        mesh = watertight(vertices, normals=normals, name=name)
+    else:
+        check_arrays(vertices, faces, name)
+        vertices = np.asarray(vertices, dtype=np.float64)
+        triangles = np.asarray(faces, dtype=np.int64)
+        if len(triangles) == 1:
+            raise MeshError(
+                f"{name}: expected a closed surface, got a single triangle. Export it again."
+            )
+        corners = vertices[triangles]
+        if (corners == corners[:, :1]).all():
+            raise MeshError(
+                f"{name}: expected a surface, but all faces lie in one point. Check the file."
+            )
+        check_size(corners.reshape(-1, 3), name)  # before squares of lengths overflow or vanish
+        mending = _Mending(name, cavities == "keep")
+        repair = mending.remade if how == "always" else mending.mended
+        mesh = repair(vertices, triangles)
     _, is_outer = mesh.outer()
     n_outer = int(is_outer.sum())
     if n_outer < least_vertices:

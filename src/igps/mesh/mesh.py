@@ -232,7 +232,7 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
     check_coordinates(v, name)
     if f.size == 0:
         raise MeshError(
-            f"{name}: no faces. A surface is needed: mesh a point cloud in another program first."
+            f"{name}: no faces. A surface is needed; a point cloud must be meshed first."
         )
     if f.ndim != 2 or f.shape[1] != 3 or not np.issubdtype(f.dtype, np.integer):
         raise MeshError(

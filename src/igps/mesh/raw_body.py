@@ -36,7 +36,7 @@ ONLY_LINES = "it holds lines, such as centre lines, which bound no body; export 
 
 @dataclass(frozen=True, eq=False)
 class RawBody:
-    """A surface as it was read, not yet checked."""
+    """A surface as it was read, not yet checked; a point cloud has no faces."""
 
     vertices: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (V, 3) length
     # (F, 3) vertex indices
@@ -44,6 +44,7 @@ class RawBody:
     part: str | None = None  # name among the bodies of the file; None if the file is a single body
     unit: str | None = None  # unit of length, such as "mm"; None if the file does not state it
     unit_from: UnitSource = "format"  # what states the unit, if there is one
+    normals: Floats | None = None  # (V, 3), of a point cloud whose file has them
     notes: tuple[str, ...] = ()  # remarks made while reading, for the user
     fault: MeshError | None = None  # why this body has no surface, while others of its file may
     make: Callable[[], RawBody] | None = None  # computes the surface if that takes time; see `made`
@@ -89,25 +90,28 @@ def deferred(
 
 
 def joined(bodies: Sequence[RawBody]) -> RawBody:
-    """Join the bodies with faces into one."""
+    """Join bodies into one: those with faces, or point clouds if none has faces."""
     bodies = [body.made() for body in bodies]
     if len(bodies) == 1:
         return replace(bodies[0], part=None)
-    joinable = [body for body in bodies if len(body.faces)]
+    meshes = [body for body in bodies if len(body.faces)]
+    joinable = meshes or [body for body in bodies if len(body.vertices)]
     if not joinable:
         return RawBody(fault=next((body.fault for body in bodies if body.fault), None))
-    for body in joinable:
+    for body in meshes:
         if body.faces.min() < 0 or body.faces.max() >= len(
             body.vertices
         ):  # would refer to another body
             raise ValueError(f"{body.part} refers to vertices that are not there")
     units = {body.unit for body in joinable}
     frames = {body.frame for body in joinable}
+    normals = [body.normals for body in joinable if body.normals is not None]
     return RawBody(
         *stacked([(body.vertices, body.faces) for body in joinable]),
         unit=units.pop() if len(units) == 1 else None,
         frame=frames.pop() if len(frames) == 1 else None,
         unit_from=joinable[0].unit_from,
+        normals=np.concatenate(normals) if len(normals) == len(joinable) else None,
         notes=tuple(dict.fromkeys(note for body in joinable for note in body.notes)),
     )
 

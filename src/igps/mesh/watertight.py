@@ -1,4 +1,4 @@
-"""Make the closed surface of one body from any triangles: distances, a flood, marching cubes.
+"""Make the closed surface of one body from any triangles or points: distances, a flood, marching cubes.
 
 The body is what a flood from outside does not reach; `_outside` decides which openings the flood passes. The grid
 points have exact distances to the triangles, negative inside the body, so the surface of a solid stays in place. Only
@@ -14,6 +14,7 @@ largest piece alone, it is far worse.
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers
 from igps._parameters import check_at_least
@@ -31,43 +32,51 @@ from igps.mesh._tidying import are_specks, places
 from igps.mesh.errors import MeshError
 from igps.mesh.isosurface import level_surface, simplify_surface
 from igps.mesh.mesh import Mesh, check_coordinates
-from igps.mesh.surface import diagonal, face_areas, face_parts, largest
+from igps.mesh.surface import diagonal, face_areas, face_parts, largest, longest_side, unit
 
 # Thickness (volume over area, half a rod's radius) in cells: the grid is refined up to the first as far as its size
 # allows, and bodies below the second get a note that they are coarse.
 _FINE = 1.5
 _COARSE = 0.75
 _MAX_FACES = 400_000  # in larger meshes, vertices are first merged within quarters of a cell, to bound time and memory
+_MAX_POINTS = 200_000  # larger clouds are thinned out first
+_LINE = 1e-5  # points on a line in single precision have a smaller ratio of spread across to spread along
 
 
 def watertight(
     vertices: Floats,
-    faces: Integers,
+    faces: Integers | None = None,
     *,
+    normals: Floats | None = None,
     resolution: int = 96,
     max_vertices: int | None = 5000,
     name: str = "mesh",
 ) -> Mesh:
-    """Make the closed, oriented, edge-manifold surface of one body from triangles in any state.
+    """Make the closed, oriented, edge-manifold surface of one body from triangles in any state, or from points.
 
     Solids keep their surface, sheets get about a cell of thickness, small openings are closed, and everything that is
     not visible from outside is filled.
 
     Args:
         vertices: (V, 3) positions, any length unit.
-        faces: (F, 3) vertex indices in any order and orientation.
+        faces: (F, 3) vertex indices in any order and orientation, or None for a point cloud.
+        normals: (V, 3) normals of a point cloud, of any length and either sign; estimated from the neighbours if None.
         resolution: the grid has about as many cells as a cube of this side. Flat and long bodies get up to
             2 * `resolution` cells along their longest side; thin closed bodies get more, with no more cells in all.
         max_vertices: approximate maximal number of vertices after simplification; None keeps all.
         name: name of the surface in error messages.
 
     Raises:
-        MeshError: there is no surface: no triangle with an area.
+        MeshError: there is no surface (fewer than ten points, or no triangle with an area).
     """
     check_at_least(8, resolution=resolution)
     vertices = np.asarray(vertices, dtype=np.float64)
     check_coordinates(vertices, name)
     notes: list[str] = []
+    spacing = 0.0
+    if faces is None or len(faces) == 0:
+        vertices, faces, spacing = splats(vertices, normals, resolution, name)
+        notes.append("points joined by small discs")
     faces = np.asarray(faces, dtype=np.int64)
     size = diagonal(vertices[faces].reshape(-1, 3))
     faces = faces[face_areas(vertices, faces) > 1e-14 * size**2]
@@ -80,7 +89,7 @@ def watertight(
     if is_speck.any():
         notes.append(f"dropped {counted(int(is_speck.sum()), 'speck')}")
         faces = faces[~is_speck[part]]
-    default_size, min_size = cell_sizes(vertices, faces, resolution)
+    default_size, min_size = cell_sizes(vertices, faces, resolution, spacing)
     grid = Grid.around(vertices, faces, min_size)
     vertices = grid.to_cells(vertices)
     if len(faces) > _MAX_FACES:
@@ -115,3 +124,53 @@ def crosses_itself(vertices: Floats, faces: Integers) -> bool:
 
     surface = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
     return bool(find_self_intersections(*surface, first_only=True)[0])
+
+
+def splats(
+    points: Floats, normals: Floats | None, resolution: int, name: str
+) -> tuple[Floats, Integers, float]:
+    """Return the vertices and faces of hexagonal discs around the points of a cloud, and the spacing of the points."""
+    if len(points) < 10:
+        raise MeshError(
+            f"{name}: expected at least 10 points for a surface, got {len(points)}. Export or scan more."
+        )
+    side = longest_side(points)
+    if side == 0:
+        raise MeshError(f"{name}: expected a surface, but all points coincide. Check the file.")
+    centred = points - points.mean(axis=0)
+    _, across, along = np.linalg.eigvalsh(centred.T @ centred)
+    if across < _LINE**2 * along:
+        raise MeshError(
+            f"{name}: expected a surface, but all {len(points)} points lie on one line. Check the file."
+        )
+    if len(points) > _MAX_POINTS:
+        # Keep one point in each quarter of a cell.
+        quarter = side / (4 * resolution)
+        lattice = np.floor((points - points.min(axis=0)) / quarter)
+        _, first = np.unique(lattice.astype(np.int64), axis=0, return_index=True)
+        points = points[first]
+        normals = None if normals is None else normals[first]
+    distance, neighbours = cKDTree(points).query(points, k=min(13, len(points)))
+    # In an even cloud, a disc reaches about the third ring of neighbours; its radius is bounded where points are rare.
+    reach = distance[:, min(6, distance.shape[1] - 1)]
+    spacing = float(np.median(reach))
+    radius = np.clip(reach, spacing / 2, 2 * spacing)
+    if normals is None:
+        local = points[neighbours] - points[neighbours].mean(axis=1, keepdims=True)
+        _, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", local, local))
+        normals = axes[:, :, 0]
+    normals = np.asarray(normals, dtype=np.float64)
+    if normals.shape != points.shape or not np.isfinite(normals).all():
+        raise MeshError(
+            f"{name}: normals: expected finite numbers of shape {points.shape}. Leave out the normals."
+        )
+    # Two directions in the plane, computed from the axis that is least parallel to the normal.
+    axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    u = unit(np.cross(normals, axis))
+    v = unit(np.cross(normals, u))
+    angle = np.arange(6)[:, None] * np.pi / 3
+    circle = np.cos(angle) * u[:, None] + np.sin(angle) * v[:, None]
+    rim = points[:, None] + radius[:, None, None] * circle
+    fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    faces = (6 * np.arange(len(points))[:, None, None] + fan).reshape(-1, 3)
+    return rim.reshape(-1, 3), faces, spacing / 2

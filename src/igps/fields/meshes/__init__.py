@@ -3,6 +3,7 @@
 from igps.fields.meshes import (
     archives,
     brains,
+    clouds,
     obj,
     off,
     ply,
@@ -17,6 +18,7 @@ FORMATS = (
     obj.FORMAT,
     ply.FORMAT,
     stl.FORMAT,
+    clouds.FORMAT,
     threemf.FORMAT,
     scenes.GLTF,
     scenes.OTHERS,

@@ -4,7 +4,7 @@ Trimesh is not used: it reads no polygons of several sizes, and no strips.
 """
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from igps._arrays import Integers
+from igps._arrays import Floats, Integers
 from igps.mesh.formats import Format
 from igps.mesh.options import LoadOptions
 from igps.mesh.polygons import flat_triangles, strip_triangles
@@ -192,8 +192,7 @@ def _even_columns(rows: NDArray[Any], element: _Element) -> Columns:
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     found = elements(path)
     points = found["vertex"]
-    coordinates = [points[axis].numbers for axis in "xyz"]
-    vertices = np.stack(coordinates, axis=1).astype(np.float64)
+    vertices = _vectors(points, ("x", "y", "z"))
     faces = [np.zeros((0, 3), dtype=np.int64)]
     for name in ("face", "tristrips"):
         rows = found.get(name)
@@ -209,7 +208,15 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
             faces.append(flat_triangles(corners, lists[0].lengths, vertices))
         else:
             faces += _strips(corners, lists[0].lengths)
-    return [RawBody(vertices, np.concatenate(faces))]
+    triangles = np.concatenate(faces)
+    normals = None
+    if not len(triangles) and {"nx", "ny", "nz"} <= points.keys():
+        normals = _vectors(points, ("nx", "ny", "nz"))
+    return [RawBody(vertices, triangles, normals=normals)]
+
+
+def _vectors(points: Columns, names: Sequence[str]) -> Floats:
+    return np.stack([points[name].numbers for name in names], axis=1).astype(np.float64)
 
 
 def _strips(corners: Integers, lengths: Integers) -> list[Integers]:

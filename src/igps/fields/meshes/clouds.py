@@ -1,0 +1,19 @@
+"""Point clouds as text: lines of three coordinates, or of six numbers with normals."""
+
+from pathlib import Path
+
+import numpy as np
+
+from igps.mesh.formats import Format
+from igps.mesh.options import LoadOptions
+from igps.mesh.raw_body import RawBody
+
+
+def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    rows = np.loadtxt(path, ndmin=2, comments=("#", "//"), encoding="latin-1")  # decodes any byte
+    if rows.shape[1] not in (3, 6):
+        raise ValueError(f"expected 3 numbers in a line, or 6 with normals, got {rows.shape[1]}")
+    return [RawBody(rows[:, :3], normals=rows[:, 3:] if rows.shape[1] == 6 else None)]
+
+
+FORMAT = Format("points", (".xyz",), read)
