@@ -7,6 +7,7 @@ import tarfile
 import zipfile
 import zlib
 
+import meshio
 import nibabel
 import numpy as np
 import SimpleITK
@@ -34,6 +35,12 @@ def write_nibabel(path):
 def write_itk(path):
     image = SimpleITK.GetImageFromArray(labels().T)
     SimpleITK.WriteImage(image, str(path), useCompression=True)
+
+
+def write_vtu(path):
+    mesh = ball()
+    cells = [("triangle", mesh.faces)]
+    meshio.Mesh(mesh.vertices, cells).write(path, compression="zlib", header_type="UInt32")
 
 
 def write_gifti(path):
@@ -101,6 +108,7 @@ WRITERS = {
     "mask.mha": write_itk,
     "mask.mhd": write_itk,
     "mask.tif": write_tiff,
+    "ball.vtu": write_vtu,
     "ball.vtp": write_vtp,
     "ball.gii": write_gifti,
     "ball.zip": write_zip,
@@ -109,7 +117,7 @@ WRITERS = {
     "ball.3mf": write_3mf,
 }
 # Where the compressed bytes begin, as a share of the file that holds them: behind headers, which have no checksum.
-STARTS = {"ball.vtp": 0.2, "ball.gii": 0.4, "mask.tif": 0.25}
+STARTS = {"ball.vtu": 0.3, "ball.vtp": 0.2, "ball.gii": 0.4, "mask.tif": 0.25}
 
 
 def stored(path):

@@ -270,9 +270,10 @@ def _image(generator):
 
 
 def _beside(generator):
-    """A grid beside a ball."""
-    suffix = str(generator.choice(["dx", "mrc", "map"]))
-    return _beside_a_ball(generator, suffix, _grid(suffix))
+    """A grid or values at vertices, beside a ball."""
+    suffix = str(generator.choice(["dx", "mrc", "map", "ply", "vtk", "shape.gii", "curv"]))
+    write = _grid if suffix in ("dx", "mrc", "map") else _at_vertices
+    return _beside_a_ball(generator, suffix, write(suffix))
 
 
 def _ball():
@@ -296,3 +297,34 @@ def _grid(suffix):
         path = Path(folder) / ("x.dx" if suffix == "dx" else "x.mrc")
         grid.export(str(path))
         return path.read_bytes()
+
+
+def _at_vertices(suffix):
+    """A file of values at vertices. GIFTI is written by nibabel, other formats are assembled here."""
+    ball = _ball()
+    values = field_at(ball.vertices).astype(np.float32)
+    if suffix == "shape.gii":
+        return nibabel.GiftiImage(darrays=[nibabel.gifti.GiftiDataArray(values)]).to_bytes()
+    if suffix == "curv":
+        return (
+            b"\xff\xff\xff"
+            + np.array([len(values), len(ball.faces), 1], ">i4").tobytes()
+            + values.astype(">f4").tobytes()
+        )
+    places = ball.vertices
+    if suffix == "vtk":
+        rows = [
+            "# vtk DataFile Version 3.0",
+            "x",
+            "ASCII",
+            "DATASET POLYDATA",
+            f"POINTS {len(places)} float",
+        ]
+        rows += [" ".join(map(repr, place)) for place in places.tolist()]
+        rows += [f"POINT_DATA {len(values)}", "SCALARS value float 1", "LOOKUP_TABLE default"]
+        return "\n".join([*rows, *map(repr, values.tolist()), ""]).encode()
+    names = "\n".join(f"property float {name}" for name in ("x", "y", "z", "value"))
+    head = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(values)}\n{names}\nend_header\n"
+    )
+    return head.encode() + np.column_stack([places, values]).astype("<f4").tobytes()

@@ -1,13 +1,15 @@
-"""What a body brings along: images, grids, residues; and what is refused."""
+"""What a body brings along: images, grids, values at vertices, residues; and what is refused."""
 
 import gzip
 import logging
 import os
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.linalg import norm
 from numpy.testing import assert_allclose
 from trimesh.creation import icosphere
@@ -19,10 +21,12 @@ from igps.data.attribute_sources import (
     fill_missing,
 )
 from igps.data.dataset import SignatureDataset
+from igps.fields.meshes.vertex_attributes import VertexAttribute
 from igps.fields.molecules.residue_attributes import ResidueAttribute
 from igps.fields.volumes.image_attribute import ImageAttribute
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
@@ -167,6 +171,73 @@ def test_a_map_that_was_cut_short_is_to_be_exported_again(body):
         attribute_source("a.mrc")(body, INSIDE)
 
 
+def write_ply(path, mesh, values):
+    numbers = np.column_stack([mesh.vertices, values]).tolist()
+    rows = "\n".join(" ".join(map(repr, row)) for row in numbers)
+    faces = "\n".join("3 " + " ".join(map(str, face)) for face in mesh.faces)
+    names = "\n".join(f"property double {name}" for name in ("x", "y", "z", "height"))
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {len(mesh.vertices)}\n{names}\nelement face {len(mesh.faces)}\n"
+        f"property list uchar int vertex_indices\nend_header\n{rows}\n{faces}\n"
+    )
+
+
+def write_vtk(path, mesh, values):
+    meshio = pytest.importorskip("meshio")
+    arrays = {"height": values, "other": np.zeros((len(values), 3))}
+    meshio.Mesh(mesh.vertices, [("triangle", mesh.faces)], point_data=arrays).write(path)
+
+
+def write_vtk_of_vtk(path, mesh, values):
+    """With the notes that VTK writes behind arrays of a field."""
+    n = len(values)
+    faces = len(mesh.faces)
+    points, heights, triangles = (
+        " ".join(map(str, a.ravel())) for a in (mesh.vertices, values, mesh.faces)
+    )
+    head = f"# vtk DataFile Version 5.1\nvtk output\nASCII\nDATASET POLYDATA\nPOINTS {n} double\n{points}\n"
+    offsets = " ".join(map(str, range(0, 3 * faces + 1, 3)))
+    cells = f"POLYGONS {faces + 1} {3 * faces}\nOFFSETS vtktypeint64\n{offsets}\nCONNECTIVITY vtkIdType\n{triangles}\n"
+    notes = "METADATA\nINFORMATION 1\nNAME L2_NORM_RANGE LOCATION vtkDataArray\nDATA 2 0 1 \n\n"
+    field = f"FIELD FieldData 2\nother 1 {n} double\n{heights}\n{notes}height 1 {n} double\n{heights}\n{notes}"
+    path.write_text(f"{head}{cells}\nPOINT_DATA {n}\n{field}")
+
+
+def write_gifti(path, mesh, values):
+    nibabel = pytest.importorskip("nibabel")
+    array = nibabel.gifti.GiftiDataArray(
+        values.astype(np.float32), intent="NIFTI_INTENT_SHAPE", meta={"Name": "height"}
+    )
+    nibabel.save(nibabel.gifti.GiftiImage(darrays=[array]), path)
+
+
+def write_freesurfer(path, mesh, values):
+    nibabel = pytest.importorskip("nibabel")
+    nibabel.freesurfer.write_morph_data(str(path), values.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("a.ply#height", write_ply),
+        ("a.vtk#height", write_vtk),
+        ("a.vtk#height", write_vtk_of_vtk),
+        ("a.shape.gii#height", write_gifti),
+        ("lh.thickness", write_freesurfer),
+    ],
+)
+def test_values_at_vertices_give_the_same_linear_function_inside(body, name, write):
+    mesh = trimesh.load(body.path, process=False)
+    path = body.path.with_name(name.partition("#")[0])
+    write(path, mesh, linear(mesh.vertices))
+    values = VertexAttribute(name)(body, INSIDE)
+    assert_allclose(values, linear(INSIDE), atol=1e-3)
+    finer = mesh.subdivide()
+    write(path, finer, linear(finer.vertices))
+    with pytest.raises(MeshError, match=r"has 642 values for 162 vertices"):
+        VertexAttribute(name)(body, INSIDE)
+
+
 @pytest.mark.filterwarnings("ignore:Unknown extension code")
 @pytest.mark.parametrize(
     "head",
@@ -205,6 +276,93 @@ def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(tmp_path, he
     assert_allclose(found, linear(INSIDE), atol=1e-4)
 
 
+def test_values_at_vertices_survive_mending(tmp_path):
+    """A ball with a triangle missing: the hole is closed, and a linear function stays one."""
+    ball = icosphere(subdivisions=3)
+    open_ball = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
+    write_ply(tmp_path / "ball.ply", open_ball, linear(open_ball.vertices))
+    found = VertexAttribute("{file}#height")(BodyRef(tmp_path / "ball.ply"), INSIDE)
+    assert_allclose(found, linear(INSIDE), atol=1e-2)
+
+
+def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(tmp_path):
+    """Two balls in one file, whose values jump between them; then values of the second ball alone."""
+    ball = icosphere(subdivisions=3)
+    away = trimesh.Trimesh(
+        ball.vertices + np.array([5, 0, 0]),
+        ball.faces,
+        process=False,
+    )
+    both = trimesh.util.concatenate([ball, away])
+    values = np.concatenate([linear(ball.vertices), linear(ball.vertices) + 100])
+    write_ply(tmp_path / "both.ply", both, values)
+    write_ply(tmp_path / "b.ply", away, linear(ball.vertices) + 7)
+    rows = [f"v {x} {y} {z}" for x, y, z in both.vertices.tolist()]
+    for name, start in (("a", 0), ("b", 1280)):
+        rows.append(f"o {name}")
+        faces = (both.faces[start : start + 1280] + 1).tolist()
+        rows += [f"f {a} {b} {c}" for a, b, c in faces]
+    (tmp_path / "two.obj").write_text("\n".join(rows))
+    for name, part, shift, added in (
+        ("both", "a", 0, 0),
+        ("both", "b", 5, 100),
+        ("b", "b", 5, 7),
+    ):
+        source = VertexAttribute(f"{name}.ply#height", reading=LoadOptions(bodies="objects"))
+        found = source(
+            BodyRef(tmp_path / "two.obj", part),
+            INSIDE + np.array([shift, 0, 0]),
+        )
+        assert_allclose(found, linear(INSIDE) + added, atol=1e-3)
+    few = icosphere(subdivisions=1)
+    write_ply(tmp_path / "few.ply", few, linear(few.vertices))
+    with pytest.raises(
+        MeshError, match=r"has 42 values for 642 vertices \(1284 in the whole file\)"
+    ):
+        replace(source, path="few.ply#height")(BodyRef(tmp_path / "two.obj", "a"), INSIDE)
+
+
+def test_values_at_the_vertices_of_a_cavity_count(tmp_path):
+    """2 on the cavity, 1 outside; in the wall, mean values by an integral over directions, weighted by 1 / distance."""
+    ball = icosphere(subdivisions=4)
+    pit = icosphere(subdivisions=4, radius=0.5)
+    pit.invert()
+    hollow = trimesh.util.concatenate([ball, pit])
+    radii = norm(hollow.vertices, axis=1)
+    hollow.vertex_attributes["heat"] = np.where(radii < 0.9, 2.0, 1.0)
+    hollow.export(tmp_path / "ball.ply")
+    (tmp_path / "bodies").mkdir()
+    hollow.export(tmp_path / "bodies" / "ball.off")
+    cosines = np.linspace(-1, 1, 20001)
+
+    def in_wall(radius):
+        across = radius**2 * cosines**2 - radius**2
+        outside = 1 / (-radius * cosines + np.sqrt(across + 1))
+        meets = (cosines < 0) & (across > -0.25)
+        root = np.sqrt(np.where(meets, across + 0.25, 0))
+        near, far = (
+            meets / np.where(meets, -radius * cosines + side * root, 1) for side in (-1, 1)
+        )
+        return float((outside + 2 * (near - far)).sum() / (outside + near - far).sum())
+
+    for cavities in ("keep", "fill"):
+        dataset = SignatureDataset(
+            tmp_path / "bodies",
+            CONFIG,
+            tmp_path / "cache",
+            reading=LoadOptions(cavities=cavities),
+            attributes={"heat": VertexAttribute("{stem}.ply", tmp_path)},
+        )
+        inside = dataset[0].signature.interior
+        surface = dataset[0].signature.surface
+        radii = norm(inside.points, axis=1)
+        expected = [in_wall(radius) if cavities == "keep" else 1.0 for radius in radii]
+        assert_allclose(inside.attributes["heat"], expected, atol=0.01)
+        on_cavity = norm(surface.points, axis=1) < 0.9
+        assert on_cavity.any() == (cavities == "keep")
+        assert_allclose(surface.attributes["heat"], 1.0 + on_cavity, atol=1e-5)
+
+
 def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog):
     points = np.arange(40.0)[:, None] * [1, 0, 0]
     values = np.arange(40.0)
@@ -232,7 +390,7 @@ def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body):
     values[:10] = np.nan
     write_nifti(body.path.with_name("egg.nii"), values)
     source = ImageAttribute("egg.nii")
-    found = source.values(body, body.path.with_name("egg.nii"), INSIDE)
+    found = source.values(body, body.path.with_name("egg.nii"), "", INSIDE)
     known = np.isfinite(found)
     assert 0 < known.sum() < len(known)
     index = (INSIDE - AFFINE[:3, 3]) @ np.linalg.inv(AFFINE[:3, :3]).T
@@ -253,18 +411,25 @@ def test_an_image_of_another_subject_and_a_grid_beside_the_body_are_refused(body
         ImageAttribute("{stem}.nii")(body, INSIDE + TURN @ [3.4, 0, 0])
 
 
-@pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd", ".dx", ".mrc"])
+@pytest.mark.parametrize(
+    "suffix", [".nii.gz", ".nrrd", ".dx", ".mrc", ".ply", ".vtk", ".vtu", ".gii", ".thickness"]
+)
 def test_files_cut_short_are_one_sentence(body, suffix):
     path = body.path.with_name(f"a{suffix}")
+    mesh = trimesh.load(body.path, process=False)
     if suffix == ".nii.gz":
         write_nifti(path, image())
     elif suffix == ".nrrd":
         write_itk(path, image())
-    else:
+    elif suffix in (".dx", ".mrc"):
         grids = pytest.importorskip("gridData")
         grids.Grid(image(), origin=[-5, -5, -5], delta=[0.5] * 3).export(str(path))
+    else:
+        writers = {".ply": write_ply, ".gii": write_gifti, ".thickness": write_freesurfer}
+        write = writers.get(suffix, write_vtk)
+        write(path, mesh, linear(mesh.vertices))
     content = path.read_bytes()
-    for share in (0, 0.02, 0.4, 0.6):
+    for share in (0, 0.02, 0.4, 0.6):  # of a PLY file all values are in the first 0.69
         path.write_bytes(content[: int(share * len(content))])
         with pytest.raises(MeshError, match=r"a\."):
             attribute_source(path.name)(body, INSIDE)
@@ -280,7 +445,7 @@ def test_patterns_name_the_file_and_lead_out_of_no_folder(tmp_path):
     root = tmp_path / "root"
 
     def file(pattern, root=root):
-        found = ImageAttribute(pattern, root).file(body)
+        found, _ = ImageAttribute(pattern, root).file(body)
         return found.relative_to(tmp_path).as_posix()
 
     assert file("images/{stem}.nii") == "root/images/one.nii"
@@ -312,13 +477,13 @@ def test_a_body_that_is_a_link_has_the_attribute_of_its_own_name(tmp_path):
         ("root", "root/cow"),
     ):
         source = ImageAttribute("ct/{file}.nii", tmp_path / root)
-        found = source.file(BodyRef(tmp_path / path / "1.off"))
+        found = source.file(BodyRef(tmp_path / path / "1.off"))[0]
         assert found.relative_to(tmp_path / root).as_posix() == f"ct/{path[-3:]}/1.off.nii"
 
 
 @pytest.mark.parametrize(
     ("suffix", "content"),
-    [("dx", b"delta"), ("nrrd", b"x")],
+    [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12)), ("nrrd", b"x")],
 )
 def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(body, suffix, content):
     body.path.with_suffix(f".{suffix}").write_bytes(content)
@@ -342,19 +507,25 @@ def test_images_among_bodies_are_no_bodies(tmp_path, is_absolute):
     dataset = SignatureDataset(tmp_path, cache_dir=tmp_path / ".cache", attributes={"ct": images})
     assert dataset.bodies.names == ("ball/x.off", "cube/x.off")
     assert dataset.classes == ("ball", "cube")
-    files = [images.file(body) for body in dataset.bodies]
+    files = [images.file(body)[0] for body in dataset.bodies]
     assert files == [tmp_path / "ct" / name / "x.off.nii.gz" for name in ("ball", "cube")]
+    # What is itself a body's file stays one.
+    own = {"thickness": attribute_source("{file}#thickness", tmp_path / "ball")}
+    dataset = SignatureDataset(tmp_path / "ball", cache_dir=tmp_path / ".cache", attributes=own)
+    assert dataset.bodies.names == ("x.off",)
 
 
 def test_words_of_the_command_line_become_sources():
-    found = attribute_sources(["ct=a/{stem}.nii.gz", "q=charge"], Path("root"))
+    found = attribute_sources(
+        ["ct=a/{stem}.nii.gz", "q=charge", "t={file}#t", "e=a.vtu"], Path("root")
+    )
     assert found == {
         "ct": ImageAttribute("a/{stem}.nii.gz", Path("root")),
         "q": ResidueAttribute("charge"),
+        "t": VertexAttribute("{file}#t", Path("root")),
+        "e": VertexAttribute("a.vtu", Path("root")),
     }
     assert pickle.loads(pickle.dumps(found)) == found
-    with pytest.raises(ValueError, match=r"attribute: no installed field reads 'a\.ply'"):
-        attribute_sources(["t=a.ply"], None)
     for wrong in ("ct", "=a.nii", "a b=c.nii", "ct="):
         with pytest.raises(
             ValueError, match="attribute: expected a new name and a path, as in ct="

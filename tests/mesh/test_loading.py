@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from trimesh.creation import icosphere
 
 from conftest import FACES, TETRAHEDRON
-from igps.fields.meshes import ply
+from igps.fields.meshes import vertex_values
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import load_mesh, read_surface
 from igps.mesh.options import LoadOptions
@@ -278,8 +278,9 @@ def test_texture_seams_do_not_split_vertices(tmp_path):
     assert_allclose(
         load_mesh(tmp_path / "seams.ply", LoadOptions(mend="never")).vertices, TETRAHEDRON
     )
-    heights = ply.elements(tmp_path / "seams.ply")["vertex"]["height"].numbers
-    assert_allclose(heights, np.array(TETRAHEDRON)[:, 2])
+    assert_allclose(
+        vertex_values.read(tmp_path / "seams.ply")["height"], np.array(TETRAHEDRON)[:, 2]
+    )
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])

@@ -94,8 +94,9 @@ _COLLECTION = (
     Option(
         "attribute",
         list[str],
-        "values inside the bodies, such as ct=images/{stem}.nii.gz: an image or a grid below "
-        "the folder; {stem}, {file} and {part} are replaced by those of each body",
+        "values inside the bodies, such as ct=images/{stem}.nii.gz: a file below the folder with an "
+        "image, a grid, or values at vertices or in tetrahedra; {stem}, {file} and {part} are replaced "
+        "by those of each body",
     ),
     Option("cache_dir", Path, "folder of the cache; by default the user's cache directory"),
 )

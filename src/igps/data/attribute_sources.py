@@ -12,9 +12,10 @@ import logging
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -26,6 +27,7 @@ from igps.data.keys import content_digest
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of, field_packages, stat_key
 from igps.mesh.loading import BodyRef
+from igps.mesh.options import LoadOptions
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +40,8 @@ class FileAttribute(ABC):
 
     Args:
         path: a pattern, in which {stem} stands for the name of the body's file without suffixes, {file} for its path
-            below `root`, and {part} for the name of the body in its file. The resulting path must lie below `root`.
+            below `root`, and {part} for the name of the body in its file. #NAME at the end selects an array of a file
+            with several arrays. The resulting path must lie below `root`.
         root: the folder of relative paths; the folder of the body's file if None.
     """
 
@@ -46,15 +49,16 @@ class FileAttribute(ABC):
     root: Path | None = None
 
     def cache_tag(self, body: BodyRef) -> str:
-        """Return kind of source and checksum of the file; raise a MeshError if it is missing."""
-        files = dependencies_of(self.file(body))
-        return f"{type(self).__name__} 5 {_checksum(*files, stamp=stat_key(*files))}"
+        """Return kind of source, name of the array, and checksum of the file; raise a MeshError if it is missing."""
+        file, name = self.file(body)
+        files = dependencies_of(file)
+        return f"{type(self).__name__} 4 {name} {_checksum(*files, stamp=stat_key(*files))}"
 
     def __call__(self, body: BodyRef, points: Floats) -> Floats:
         """Return values (P,) or (P, C) at points (P, 3); raise a MeshError if the file cannot be used."""
-        file = self.file(body)
+        file, name = self.file(body)
         try:
-            values = self.values(body, file, points)
+            values = self.values(body, file, name, points)
         except MemoryError:
             raise
         except MeshError as error:
@@ -70,8 +74,12 @@ class FileAttribute(ABC):
             ) from error
         return fill_missing(values, points, f"{body}: {file}")
 
+    def reading_by(self, options: LoadOptions) -> Self:
+        """Return a source that reads the body's own file by these options, if it does read it."""
+        return self
+
     @abstractmethod
-    def values(self, body: BodyRef, file: Path, points: Floats) -> Floats:
+    def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
         """Return values (P,) or (P, C) at points (P, 3), NaN where they are missing."""
 
     def files(self, paths: Iterable[Path]) -> set[Path]:
@@ -79,13 +87,13 @@ class FileAttribute(ABC):
         files = set()
         for path in paths:
             with contextlib.suppress(MeshError):
-                if (file := self.file(BodyRef(path))) != path:
+                if (file := self.file(BodyRef(path))[0]) != path:
                     files.add(file)
         return files
 
-    def file(self, body: BodyRef) -> Path:
-        """Return the file of a body; raise a MeshError if there is no such file."""
-        pattern = self.path
+    def file(self, body: BodyRef) -> tuple[Path, str]:
+        """Return the file of a body and the name of its array, or ""; raise a MeshError if there is no such file."""
+        pattern, _, name = self.path.partition("#")
         root = body.path.parent if self.root is None else self.root
         # Links in the path of the folder are resolved only if needed. The file itself may be a link to any place
         locations = (
@@ -116,7 +124,7 @@ class FileAttribute(ABC):
             raise MeshError(
                 f"{body}: its attribute file {path} does not exist. Check the pattern {self.path!r}."
             )
-        return path
+        return path, name
 
 
 @lru_cache(maxsize=1000)
@@ -131,7 +139,7 @@ class SourceKind:
 
     make: Callable[[str, Path | None], AttributeSource]  # of a name, or of a pattern and its root
     names: tuple[str, ...] = ()  # attributes that the file of a body itself gives
-    suffixes: tuple[str, ...] = ()  # of files with values, in lower case
+    suffixes: tuple[str, ...] = ()  # of files with values, in lower case; "" for all other files
 
 
 def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
@@ -139,7 +147,7 @@ def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
     named = named_source(path)
     if named is not None:
         return named
-    file = path.lower()
+    file = path.partition("#")[0].lower()
     matches: dict[str, SourceKind] = {}
     for kind in _source_kinds():
         matches |= {suffix: kind for suffix in kind.suffixes if file.endswith(suffix)}
@@ -163,6 +171,13 @@ def attribute_names() -> list[str]:
 
 def _source_kinds() -> list[SourceKind]:
     return [kind for field in field_packages() for kind in getattr(field, "ATTRIBUTES", ())]
+
+
+def with_load_options(source: AttributeSource, options: LoadOptions) -> AttributeSource:
+    """Return a source that reads the body itself by these options, but with open surfaces closed."""
+    if not isinstance(source, FileAttribute):
+        return source
+    return source.reading_by(replace(options, allow_open=False, mend="auto"))
 
 
 def attribute_sources(definitions: Sequence[str], root: Path | None) -> dict[str, AttributeSource]:

@@ -15,6 +15,7 @@ import numpy as np
 from igps._arrays import Singles
 from igps._threads import one_thread
 from igps.data.added_attributes import AttributeSource, with_attribute
+from igps.data.attribute_sources import with_load_options
 from igps.data.cache import Cache, Kind, Record, decode, encode
 from igps.data.cache_hit import CacheHit
 from igps.data.keys import Content, derived_key, file_digest, signature_key
@@ -310,8 +311,8 @@ class SignaturePipeline:
         if cached is not None:
             return cached
         points = [getattr(signature, kind).points for kind in SAMPLE_KINDS]
-        values_at = self.attributes[name](body, np.concatenate(points))
-        rows = np.split(values_at, [len(points[0])])
+        source = with_load_options(self.attributes[name], self.reading)
+        rows = np.split(source(body, np.concatenate(points)), [len(points[0])])
         checked = with_attribute(signature, name, dict(zip(SAMPLE_KINDS, rows, strict=True)))
         values: dict[Any, Singles] = {
             kind: getattr(checked, kind).attributes[name] for kind in SAMPLE_KINDS

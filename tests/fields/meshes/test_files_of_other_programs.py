@@ -321,6 +321,11 @@ def test_materials_that_a_scene_requires_do_not_matter(tmp_path):
             "0 0 0 1 0 0 1 1 0 1 1 1\nLINES 1 5\n4 0 1 2 3\n",
         ),
         (
+            "grid.vtk",
+            "# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 4 float\n"
+            "0 0 0 1 0 0 1 1 0 1 1 1\nCELLS 1 5\n4 0 1 2 3\nCELL_TYPES 1\n4\n",
+        ),
+        (
             "line.vtp",
             '<VTKFile type="PolyData"><PolyData><Piece NumberOfPoints="3" NumberOfLines="1"><Points>'
             '<DataArray type="Float32" NumberOfComponents="3" format="ascii">0 0 0 1 0 0 1 1 0'

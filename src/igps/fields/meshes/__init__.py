@@ -1,5 +1,6 @@
-"""Surfaces: files of triangles and polygons, scenes, and archives."""
+"""Surfaces: files of triangles and polygons, scenes, archives, and values at vertices."""
 
+from igps.data.attribute_sources import SourceKind
 from igps.fields.meshes import (
     archives,
     brains,
@@ -10,6 +11,7 @@ from igps.fields.meshes import (
     scenes,
     stl,
     threemf,
+    vertex_attributes,
     vtk,
 )
 
@@ -29,3 +31,4 @@ FORMATS = (
     archives.ARCHIVE,
     archives.COMPRESSED,
 )
+ATTRIBUTES = (SourceKind(vertex_attributes.VertexAttribute, suffixes=("",)),)

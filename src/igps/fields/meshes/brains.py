@@ -51,6 +51,20 @@ def read_gifti(path: Path, options: LoadOptions, part: str | None) -> list[RawBo
     return [RawBody(vertices, arrays[_TRIANGLES].astype(np.int64), unit="mm", frame="RAS")]
 
 
+def gifti_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.generic]]:
+    """Return the arrays of values at vertices of a GIFTI file by name."""
+    arrays = {}
+    for number, element in enumerate(_xml.parse(path.read_bytes()).iter("DataArray"), 1):
+        if element.get("Intent") not in (_POINTS, _TRIANGLES):
+            names = [
+                entry.findtext("Value")
+                for entry in element.iter("MD")
+                if entry.findtext("Name") == "Name"
+            ]
+            arrays[(names or [None])[0] or f"array {number}"] = _array(element, path, options)
+    return arrays
+
+
 def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.generic]:
     if (n_axes := int(element.get("Dimensionality", "2"))) > _MAX_AXES:
         raise ValueError(f"an array of {n_axes} axes, expected at most {_MAX_AXES}")

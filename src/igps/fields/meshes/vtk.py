@@ -1,4 +1,4 @@
-"""VTK: polygons in legacy files (.vtk) and XML files (.vtp), as text or bytes. Values at vertices are not read.
+"""VTK: legacy files of polygons or cells (.vtk), and XML files (.vtp, .vtu), as text or bytes.
 
 No library is used: meshio does not read PolyData, and VTK itself takes a hundred megabytes and ends the process if a
 header declares too large a size.
@@ -6,7 +6,6 @@ header declares too large a size.
 
 import base64
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -14,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Floats, Integers
-from igps.fields.meshes import _xml
+from igps.fields.meshes import _vtk_cells, _xml
 from igps.mesh.formats import Format
 from igps.mesh.limits import check_unpacked
 from igps.mesh.options import LoadOptions
-from igps.mesh.polygons import corners_of_rows, flat_triangles, strip_triangles
+from igps.mesh.polygons import corners_of_rows
 from igps.mesh.raw_body import ONLY_LINES, RawBody
 
 _LEGACY_TYPES = {  # VTK writes vtkIdType as int
@@ -48,19 +47,20 @@ _XML_TYPES = {
     "UInt64": "u8",
 }
 _BLANK_LINE = re.compile(rb"\n\r?\n")
-# Sections of the surface in legacy and in XML files.
-_LEGACY_CELLS = {"POLYGONS": "polygons", "TRIANGLE_STRIPS": "strips", "LINES": "lines"}
-_XML_CELLS = {"Polys": "polygons", "Strips": "strips", "Lines": "lines"}
+# Types of cells by the sections of legacy and of XML files.
+_LEGACY_CELLS = {
+    "POLYGONS": _vtk_cells.POLYGON,
+    "TRIANGLE_STRIPS": _vtk_cells.STRIP,
+    "LINES": _vtk_cells.POLY_LINE,
+}
+_XML_CELLS = {
+    "Polys": _vtk_cells.POLYGON,
+    "Strips": _vtk_cells.STRIP,
+    "Lines": _vtk_cells.POLY_LINE,
+}
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
-
-
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Polygons, strips of triangles or lines."""
-
-    kind: str
-    corners: Integers  # laid end to end
-    n_corners: Integers  # of each cell
+# Corners laid end to end; corner counts of cells; types of cells
+Cells = tuple[Integers, Integers, Integers]
 
 
 class _Legacy:
@@ -125,43 +125,97 @@ class _Legacy:
             _, width, length, kind = self.line().split()
             self.numbers(int(width) * int(length), kind)
 
-    def geometry(self) -> tuple[Floats, list[_Cells]]:
-        """Read points and cells, up to the first value at points or cells."""
+    def geometry(self) -> tuple[Floats, list[Cells], str]:
+        """Read points and cells; return also the first line behind them."""
         vertices = np.zeros((0, 3))
-        cells: list[_Cells] = []
+        cells: list[Cells] = []
+        while (words := self.line().split()) and words[0].upper() not in (
+            "POINT_DATA",
+            "CELL_DATA",
+        ):
+            word = words[0].upper()
+            if word == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
+                raise ValueError(f"expected POLYDATA or UNSTRUCTURED_GRID, got {words[1]}")
+            if word == "POINTS":
+                vertices = (
+                    self.numbers(3 * int(words[1]), words[2]).astype(np.float64).reshape(-1, 3)
+                )
+            elif word in ("POLYGONS", "TRIANGLE_STRIPS", "CELLS", "VERTICES", "LINES"):
+                corners, n_corners = self.cells(int(words[1]), int(words[2]))
+                cells.append(
+                    (corners, n_corners, np.full(len(n_corners), _LEGACY_CELLS.get(word, 0)))
+                )
+            elif word == "CELL_TYPES" and cells:
+                cells[-1] = (*cells[-1][:2], self.numbers(int(words[1]), "int").astype(np.int64))
+            elif word == "FIELD":
+                self.skip_field(int(words[2]))
+            elif word != "DATASET":  # skipped cells would leave a cloud of points
+                raise ValueError(f"expected a section of points or cells, got {word[:40]!r}")
+        return vertices, cells, " ".join(words).upper()
+
+    def arrays(self, heading: str, n_points: int) -> dict[str, NDArray[np.generic]]:
+        """Read the arrays at points by name; `heading` is the line before."""
+        arrays: dict[str, NDArray[np.generic]] = {}
+        is_of_points = heading.startswith("POINT_DATA")
+        n = n_points
         while words := self.line().split():
             word = words[0].upper()
             if word in ("POINT_DATA", "CELL_DATA"):
-                break
-            if word == "DATASET":
-                _check_polygons(words[1])
-            elif word == "POINTS":
-                numbers = self.numbers(3 * int(words[1]), words[2])
-                vertices = numbers.astype(np.float64).reshape(-1, 3)
-            elif word in (*_LEGACY_CELLS, "VERTICES"):
-                corners, n_corners = self.cells(int(words[1]), int(words[2]))
-                if word in _LEGACY_CELLS:
-                    cells.append(_Cells(_LEGACY_CELLS[word], corners, n_corners))
-            elif word == "FIELD":
-                self.skip_field(int(words[2]))
-            else:  # skipped cells would leave a cloud of points
-                raise ValueError(f"expected a section of points or polygons, got {word[:40]!r}")
-        return vertices, cells
-
-
-def _check_polygons(kind: str) -> None:
-    """Raise a ValueError for data sets that are no surface, such as grids of volume cells."""
-    if kind.upper() != "POLYDATA":
-        remedy = "save its surface as PolyData, in ParaView by Extract Surface"
-        raise ValueError(f"expected PolyData, got {kind[:40]}; {remedy}")
+                is_of_points = word == "POINT_DATA"
+                n = int(words[1])
+                continue
+            n_arrays = (
+                int(words[2]) if word == "FIELD" else word in ("VECTORS", "NORMALS", "SCALARS")
+            )
+            for _ in range(n_arrays):
+                if word == "FIELD":
+                    name, width, length, kind = self.line().split()
+                else:
+                    name = words[1]
+                    width = "3"
+                    length = str(n)
+                    kind = words[2]
+                if word == "SCALARS":
+                    width = words[3] if len(words) > 3 else "1"
+                    before = self._at
+                    if not self.line().upper().startswith("LOOKUP_TABLE"):
+                        self._at = before
+                values = self.numbers(int(width) * int(length), kind).reshape(
+                    int(length), int(width)
+                )
+                if is_of_points and int(length) == n_points:
+                    arrays[name] = _squeezed(values)
+        return arrays
 
 
 def read_legacy(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    return [_body(*_Legacy(path.read_bytes()).geometry())]
+    return [_body(*_Legacy(path.read_bytes()).geometry()[:2])]
+
+
+def point_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.generic]]:
+    """Read the arrays (V,) or (V, C) at the points of a VTK file of one piece, by name."""
+    if path.suffix.lower() == ".vtk":
+        legacy = _Legacy(path.read_bytes())
+        vertices, _, heading = legacy.geometry()
+        return legacy.arrays(heading, len(vertices))
+    file = _Xml(path, options)
+    pieces = list(file.root.iter("Piece"))
+    if len(pieces) != 1:
+        raise ValueError(f"expected one piece, got {len(pieces)}")
+    vertices, _ = file.geometry(pieces[0])
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for element in pieces[0].findall("PointData/DataArray"):
+        values = file.array(element).reshape(len(vertices), -1)
+        arrays[element.get("Name") or f"array {len(arrays) + 1}"] = _squeezed(values)
+    return arrays
+
+
+def _squeezed(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    return values[:, 0] if values.shape[1] == 1 else values
 
 
 def read_xml(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """Read the surfaces of an XML file of polygons; each piece is a body."""
+    """Read the surfaces of an XML file of polygons or cells; each piece is a body."""
     file = _Xml(path, options)
     pieces = list(file.root.iter("Piece"))
     if len(pieces) == 1:
@@ -187,7 +241,6 @@ class _Xml:
             self._appended = content[begin : content.rfind(b"</AppendedData>")]
             content = content[:start] + b"</VTKFile>"
         self.root = _xml.parse(content)
-        _check_polygons(self.root.get("type", "PolyData"))
         self._order = _xml.byte_order(self.root.get("byte_order", "LittleEndian"))
         self._header = np.dtype(
             f"{self._order}u{8 if self.root.get('header_type') == 'UInt64' else 4}"
@@ -199,21 +252,31 @@ class _Xml:
             )
         self._compressor = None if name is None else _COMPRESSORS[name]
 
-    def geometry(self, piece: Element) -> tuple[Floats, list[_Cells]]:
+    def geometry(self, piece: Element) -> tuple[Floats, list[Cells]]:
         points = piece.find("Points/DataArray")
         if points is None:
             raise ValueError("no points in it")
         vertices = self.array(points).astype(np.float64).reshape(-1, 3)
         _check_declared(piece, "Points", len(vertices))
-        cells: list[_Cells] = []
-        for group, kind in _XML_CELLS.items():
-            arrays = {}
-            for element in piece.findall(f"{group}/DataArray"):
-                arrays[element.get("Name")] = self.array(element).astype(np.int64)
-            ends = arrays.get("offsets", np.zeros(0, dtype=np.int64))
-            _check_declared(piece, group, len(ends))
-            if len(ends):
-                cells.append(_Cells(kind, arrays["connectivity"], np.diff(ends, prepend=0)))
+        cells: list[Cells] = []
+        for group in (*_XML_CELLS, "Cells"):
+            arrays = {
+                element.get("Name"): self.array(element)
+                for element in piece.findall(f"{group}/DataArray")
+            }
+            _check_declared(piece, group, len(arrays.get("offsets", ())))
+            if len(arrays) >= 2:
+                n_corners = np.asarray(
+                    np.diff(arrays["offsets"].astype(np.int64), prepend=0), dtype=np.int64
+                )
+                kinds = (
+                    arrays["types"]
+                    if group == "Cells"
+                    else np.full(len(n_corners), _XML_CELLS[group])
+                )
+                cells.append(
+                    (arrays["connectivity"].astype(np.int64), n_corners, kinds.astype(np.int64))
+                )
         return vertices, cells
 
     def array(self, element: Element) -> NDArray[np.generic]:
@@ -273,20 +336,15 @@ def _n_letters(n_bytes: int) -> int:
     return 4 * -(-n_bytes // 3)  # in base64
 
 
-def _body(vertices: Floats, cells: list[_Cells], part: str | None = None) -> RawBody:
+def _body(vertices: Floats, cells: list[Cells], part: str | None = None) -> RawBody:
     """Make a body of the surface of cells; a ValueError if the counts do not add up."""
     faces = [np.zeros((0, 3), dtype=np.int64)]
     has_lines = False
-    for own in cells:
-        if (own.n_corners < 0).any() or own.n_corners.sum() != len(own.corners):
+    for corners, n_corners, kinds in cells:
+        if len(kinds) != len(n_corners) or (n_corners < 0).any() or n_corners.sum() != len(corners):
             raise ValueError("the numbers of cells and corners do not agree")
-        if own.kind == "polygons":
-            faces.append(flat_triangles(own.corners, own.n_corners, vertices))
-        elif own.kind == "strips":
-            strips = np.split(own.corners, np.cumsum(own.n_corners)[:-1])
-            faces += [strip_triangles(strip) for strip in strips]
-        else:
-            has_lines |= len(own.n_corners) > 0
+        faces.append(_vtk_cells.surface(corners, n_corners, kinds, vertices))
+        has_lines |= bool(np.isin(kinds, _vtk_cells.LINES).any())
     triangles = np.concatenate(faces)
     if has_lines and not len(triangles):
         raise ValueError(ONLY_LINES)
@@ -294,4 +352,4 @@ def _body(vertices: Floats, cells: list[_Cells], part: str | None = None) -> Raw
 
 
 LEGACY = Format("VTK", (".vtk",), read_legacy)
-XML = Format("VTK XML", (".vtp",), read_xml, bodies=("whole", "objects"))
+XML = Format("VTK XML", (".vtp", ".vtu"), read_xml, bodies=("whole", "objects"))

@@ -19,6 +19,6 @@ class ImageAttribute(FileAttribute):
     NIfTI, MGH, NRRD and MetaImage are in world coordinates (RAS, millimetres); OpenDX, MRC and CCP4 in ångström.
     """
 
-    def values(self, body: BodyRef, file: Path, points: Floats) -> Floats:
+    def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
         grid, affine = images.read(file, stat_key(*dependencies_of(file)))
         return Grid(grid, affine).at(brains.in_scanner(body.path, points))
