@@ -16,7 +16,7 @@ def known_surface(cache: Cache, key: str, part: str | None) -> RawBody | None:
         fields: dict[str, Any] = {name: json.loads(record.texts[name]) for name in _FIELDS}
         fields["notes"] = tuple(fields["notes"])
         arrays = record.arrays
-        return RawBody(arrays["vertices"], arrays["faces"], part, **fields)
+        return RawBody(arrays["vertices"], arrays["faces"], part, denoise=False, **fields)
 
     return cache.get(key, decode)
 

@@ -61,7 +61,7 @@ _CHIRAL = 2.0
 # Smallest share of the flat places that tells a changed body, see `changed_share`
 _MIN_CHANGED = 0.01
 
-_HANDLE_PRESERVING: set[Step] = {"welded", "subdivided"}  # steps of mending
+_HANDLE_PRESERVING: set[Step] = {"welded", "smoothed", "subdivided"}  # steps of mending
 
 
 def distance_if_alike(

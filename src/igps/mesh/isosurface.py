@@ -2,16 +2,22 @@
 
 import numpy as np
 
-from igps._arrays import Floats, Integers, Singles, Surface
+from igps._arrays import Booleans, Floats, Integers, Singles, Surface
 from igps.mesh._collapse_loops import collapse_edges
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles
 from igps.mesh.errors import MeshError
 from igps.mesh.surface import (
     directed_edges,
+    dots,
     face_areas,
     signed_volume,
     vertex_normals,
 )
+
+# Of the normals of two triangles, before and after a flip of their edge, with the mean normal
+_MIN_COSINE = 0.95
+_MIN_GAIN = 1e-3  # radians that two opposite angles exceed 180° by, so that their edge is flipped
+_MAX_FLIPS = 30  # rounds of flips
 
 
 def level_surface(field: Singles, name: str) -> Surface:
@@ -46,6 +52,7 @@ def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Su
     if len(vertices) <= max_vertices:
         return vertices, faces
     points, triangles = collapse_edges(vertices, faces, max_vertices)
+    triangles = _flip_edges(points, triangles)
     return restore_volume(points, triangles, signed_volume(vertices, faces)), triangles
 
 
@@ -71,3 +78,97 @@ def _non_manifold_edges(faces: Integers, n_vertices: int) -> Integers:
     forward, n_forward = np.unique(forward, return_counts=True)
     keys = np.concatenate([forward[n_forward > 1], np.setxor1d(forward, backward)])
     return np.stack([keys // n_vertices, keys % n_vertices], axis=1)
+
+
+def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
+    """Flip the edges in flat places whose two opposite angles add up to more than 180°.
+
+    Quadrics leave long thin triangles in flat places. There the flips lead to a Delaunay triangulation, on which the
+    cotangent weights are positive. Edges at which the surface bends are kept.
+    """
+    for _ in range(_MAX_FLIPS):
+        side, other, corners = _quadrilaterals(faces, len(vertices))
+        ends = vertices[corners]
+        a, b, c, d = ends
+        gain = _angle(c, a, b) + _angle(d, b, a) - np.pi
+        flips = np.flatnonzero(gain > _MIN_GAIN)
+        c, d = corners[2:, flips]
+        can_flip = _are_flat(*ends[:, flips]) & (c != d)
+        can_flip &= ~_are_edges(c, d, faces, len(vertices))
+        flips = flips[can_flip]
+        _, _, c, d = corners[:, flips]
+        new_edges = np.minimum(c, d) * len(vertices) + np.maximum(c, d)
+        left = side[flips] // 3
+        right = other[flips] // 3
+        chosen = _independent(left, right, gain[flips], new_edges)
+        if not len(chosen):
+            break
+        a, b, c, d = corners[:, flips[chosen]]
+        faces = faces.copy()
+        faces[left[chosen]] = np.stack([c, d, b], axis=1)
+        faces[right[chosen]] = np.stack([d, c, a], axis=1)
+    return faces
+
+
+def _quadrilaterals(faces: Integers, n_vertices: int) -> tuple[Integers, Integers, Integers]:
+    """Return for each edge its side in one face, the opposite side in the face beyond, and four vertices (4, E).
+
+    These are the ends a and b of the edge, the third corner c of the one face, and the third corner d of the other.
+    """
+    start, end = directed_edges(faces)
+    opposite = np.roll(faces, 1, axis=1).ravel()
+    forward = start * n_vertices + end
+    order = np.argsort(forward)
+    side = np.nonzero(start < end)[0]
+    backward = end[side] * n_vertices + start[side]
+    other = order[np.searchsorted(forward[order], backward)]
+    return side, other, np.stack([start[side], end[side], opposite[side], opposite[other]])
+
+
+def _are_flat(a: Floats, b: Floats, c: Floats, d: Floats) -> Booleans:
+    """Return where the triangles abc and bad, and those after a flip, have nearly the same normal."""
+    old = [np.cross(b - a, c - a), np.cross(a - b, d - b)]
+    new = [np.cross(d - c, b - c), np.cross(c - d, a - d)]
+    mean = old[0] + old[1]
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    mean = mean / np.maximum(length, 1e-30)
+    is_flat = np.ones(len(a), dtype=bool)
+    for vectors in (*old, *new):
+        size = np.linalg.norm(vectors, axis=1)
+        is_parallel = dots(vectors, mean) > _MIN_COSINE * size
+        # The normal of a triangle without area does not matter.
+        has_no_area = size < 1e-3 * length[:, 0]
+        is_flat &= is_parallel | has_no_area
+    return is_flat
+
+
+def _are_edges(a: Integers, b: Integers, faces: Integers, n_vertices: int) -> Booleans:
+    """Return which pairs of vertices are edges of the surface."""
+    start, end = directed_edges(faces)
+    pairs = np.minimum(a, b) * n_vertices + np.maximum(a, b)
+    edges = np.minimum(start, end) * n_vertices + np.maximum(start, end)
+    return np.isin(pairs, edges)
+
+
+def _independent(left: Integers, right: Integers, gain: Floats, new_edges: Integers) -> Integers:
+    """Choose flips: each face takes part only in its best one, and no two create the same edge."""
+    last = max(left.max(initial=0), right.max(initial=0))
+    best = np.full(last + 1, -np.inf)
+    for face in (left, right):
+        np.maximum.at(best, face, gain)
+    is_best = (gain >= best[left]) & (gain >= best[right])
+    chosen = np.flatnonzero(is_best)
+    _, first = np.unique(new_edges[chosen], return_index=True)
+    chosen = chosen[first]
+    in_flips = np.concatenate([left[chosen], right[chosen]])
+    flipped, count = np.unique(in_flips, return_counts=True)
+    repeated = flipped[count > 1]
+    is_free = ~np.isin(left[chosen], repeated) & ~np.isin(right[chosen], repeated)
+    return chosen[is_free]
+
+
+def _angle(apex: Floats, a: Floats, b: Floats) -> Floats:
+    u = a - apex
+    v = b - apex
+    sine = np.linalg.norm(np.cross(u, v), axis=1)
+    return np.arctan2(sine, dots(u, v))

@@ -199,6 +199,7 @@ def surface_body(
         least_vertices=least_vertices,
         normals=raw.normals,
         cavities=options.cavities,
+        denoise=raw.denoise,
         name=name,
     )
     # Of another surface, such as one of the pieces, the area is not known

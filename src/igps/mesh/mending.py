@@ -1,12 +1,12 @@
-"""Make a body of a surface by as few repairs as possible: weld, fill, unite, subdivide, or make watertight.
+"""Make a body of a surface by as few repairs as possible: weld, fill, unite, smooth, subdivide, or make watertight.
 
-A mesh that is a body already is returned bit for bit. Every repair is recorded in the notes of the mesh,
+A mesh that is a body already and not noisy is returned bit for bit. Every repair is recorded in the notes of the mesh,
 and `repair_steps` returns the repairs that notes record.
 """
 
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, get_args
 
@@ -23,6 +23,7 @@ from igps.mesh._tidying import (
     weld,
 )
 from igps.mesh._union import unite_parts
+from igps.mesh.denoising import is_noisy, remove_noise
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh, check_arrays, check_coordinates, check_size
 from igps.mesh.options import Cavities, Mending
@@ -32,7 +33,7 @@ from igps.mesh.watertight import crosses_itself, watertight
 
 logger = logging.getLogger(__name__)
 
-Step = Literal["welded", "filled", "united", "subdivided", "watertight"]
+Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
 
 MENDING_VERSION = 12
 """Part of the cache keys of mended bodies; incremented whenever mending a surface gives another body."""
@@ -58,14 +59,15 @@ def mend(
     least_vertices: int = 0,
     normals: Floats | None = None,
     cavities: Cavities = "fill",
+    denoise: bool = True,
     name: str = "mesh",
 ) -> Mesh:
     """Make a body of a surface in any state, by as few repairs as possible.
 
     Repairs are made in this order, until the surface is a body: weld coincident vertices, drop degenerate and duplicate
     faces, and orient the faces; drop fins and specks; fill small holes; drop closed parts inside the body; unite
-    overlapping closed parts; make it `watertight`. A body of fewer than `least_vertices` vertices is subdivided,
-    longest edges first.
+    overlapping closed parts; make it `watertight`. A body that is rough with scanner noise is smoothed, because noise
+    adds area. A body of fewer than `least_vertices` vertices is subdivided, longest edges first.
 
     Args:
         vertices: (V, 3) positions, any length unit.
@@ -76,6 +78,7 @@ def mend(
         normals: (V, 3) normals of a point cloud, if known.
         cavities: "fill" drops closed parts inside the body. "keep" makes them the surfaces of hollows, unless the body
             is made watertight.
+        denoise: smooth a surface that is rough with noise. Thin branches made of voxels look like noise.
         name: name of the surface in error messages, usually its file.
 
     Raises:
@@ -107,7 +110,7 @@ def mend(
                 f"{name}: expected a surface, but all faces lie in one point. Check the file."
             )
         check_size(corners.reshape(-1, 3), name)  # before squares of lengths overflow or vanish
-        mending = _Mending(name, cavities == "keep")
+        mending = _Mending(name, cavities == "keep", denoise)
         repair = mending.remade if how == "always" else mending.mended
         mesh = repair(vertices, triangles)
     _, is_outer = mesh.outer()
@@ -136,6 +139,7 @@ class _Mending:
 
     name: str
     cavities: bool
+    denoise: bool
 
     def mended(self, vertices: Floats, faces: Integers) -> Mesh:
         """Return the body after as few repairs as possible."""
@@ -152,32 +156,42 @@ class _Mending:
         body = self._body(*unite_parts(*original, united), united)
         if body is not None:
             return body
-        body = watertight(vertices, faces, name=self.name)
+        body = watertight(self._smooth(vertices, faces, notes), faces, name=self.name)
         notes += _open_notes(vertices, faces, body.volume)
         return body.annotated(notes=tuple(notes))
 
     def remade(self, vertices: Floats, faces: Integers) -> Mesh:
-        """Return the welded body, watertight only if that is no body, or one that crosses itself."""
-        # The grid is the last resort: it would join parts that are nearer than a cell, such as the coils of a spring.
+        """Return the welded and smooth body, watertight only if that is no body, or one that crosses itself."""
         notes: list[str] = []
-        body = self._uncrossed(vertices, faces, notes)
-        if body is None and len(faces):
-            body = self._uncrossed(*weld(vertices, faces, notes), notes)
-        return watertight(vertices, faces, name=self.name) if body is None else body
-
-    def _uncrossed(self, vertices: Floats, faces: Integers, notes: list[str]) -> Mesh | None:
-        """Return the body with this surface, or None if it bounds no body or crosses itself."""
-        body = self._body(vertices, faces, notes)
-        if body is None or crosses_itself(body.vertices, body.faces):
-            return None
-        return body
+        surface = vertices, faces
+        # The grid is the last resort: it would join parts that are nearer than a cell, such as the coils of a spring.
+        for step in (None, weld):
+            if step is not None:
+                surface = step(vertices, faces, notes)
+            body = self._body(*surface, notes)
+            if body is not None and not crosses_itself(body.vertices, body.faces):
+                return body
+            notes = []
+        smooth = self._smooth(*surface, notes)
+        last = (smooth, surface[1]) if notes else (vertices, faces)
+        return watertight(*last, name=self.name).annotated(notes=tuple(notes))
 
     def _body(self, vertices: Floats, faces: Integers, notes: list[str]) -> Mesh | None:
-        """Return the body with this surface, or None if the surface bounds no body."""
+        """Return the body with this surface, smoothed if it is noisy, or None if the surface bounds no body."""
         try:
-            return Mesh(vertices, faces, name=self.name, notes=tuple(notes), cavities=self.cavities)
+            mesh = Mesh(vertices, faces, name=self.name, notes=tuple(notes), cavities=self.cavities)
         except MeshError:
             return None
+        smooth = self._smooth(mesh.vertices, mesh.faces, notes)
+        if smooth is mesh.vertices:
+            return mesh
+        return replace(mesh, vertices=smooth, notes=tuple(notes))
+
+    def _smooth(self, vertices: Floats, faces: Integers, notes: list[str]) -> Floats:
+        if not self.denoise or not len(faces) or not is_noisy(vertices, faces):
+            return vertices
+        notes.append("smoothed: the surface was rough with noise")
+        return remove_noise(vertices, faces)
 
 
 def _open_notes(vertices: Floats, faces: Integers, volume: float) -> list[str]:

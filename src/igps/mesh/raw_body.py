@@ -49,6 +49,8 @@ class RawBody:
     fault: MeshError | None = None  # why this body has no surface, while others of its file may
     make: Callable[[], RawBody] | None = None  # computes the surface if that takes time; see `made`
     voxels: Callable[[], LabelVoxels] | None = None  # returns the voxels of a label
+    # Whether the surface may be noisy; False if it was computed from voxels or atoms
+    denoise: bool = True
     frame: Frame = None  # see `Mesh`
     fine_area: float | None = None  # see `Mesh`
     given: Mapping[str, float] = field(default_factory=dict)  # see `Mesh`
@@ -81,6 +83,7 @@ def deferred(
             unit_from,
             notes=mesh.notes,
             voxels=voxels,
+            denoise=False,
             frame=mesh.frame,
             fine_area=mesh.fine_area,
             given=mesh.given,
@@ -113,6 +116,7 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
         unit_from=joinable[0].unit_from,
         normals=np.concatenate(normals) if len(normals) == len(joinable) else None,
         notes=tuple(dict.fromkeys(note for body in joinable for note in body.notes)),
+        denoise=any(body.denoise for body in joinable),
     )
 
 

@@ -203,7 +203,7 @@ def label_surface(
         name=name,
         unit=volume.unit,
     )
-    mesh = mend(vertices, faces, how=how, cavities=cavities, name=name)
+    mesh = mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name)
     notes = (*volume.notes, *notes)
     given = voxel_numbers(mask, affine)
     mesh = mesh.annotated(notes=notes, frame=volume.frame, given=given)
