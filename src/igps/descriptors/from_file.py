@@ -3,6 +3,7 @@
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -45,7 +46,8 @@ def load(path: str | Path) -> Descriptor:
         with torch.device("cpu"):
             return load(path).to("meta")
     if str(path).lower().endswith(_YAML):
-        module, card = _written_module(Path(path)), {}
+        module = _written_module(Path(path))
+        card: dict[str, Any] = {}
     else:
         module, card = load_module(path)
     if not isinstance(module, Descriptor):
