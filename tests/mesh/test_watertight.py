@@ -356,13 +356,6 @@ def test_follows_the_surface_when_it_is_moved_and_scaled():
     assert euler == 0
 
 
-def test_many_triangles_are_rounded_first(monkeypatch):
-    monkeypatch.setattr("igps.mesh.watertight._MAX_FACES", 1000)
-    body = watertight(*arrays(ball(subdivisions=5)), resolution=64)
-    assert np.abs(norm(body.vertices, axis=1) - 1).max() < 0.5 * 2 / 64
-    assert body.volume == pytest.approx(BALL, rel=0.01)
-
-
 def test_inputs_stay_as_they_are():
     vertices, faces = arrays(ball())
     before = vertices.copy(), faces.copy()

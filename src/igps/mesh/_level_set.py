@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
-from igps._arrays import Booleans, Floats, Integers, Singles, Surface
+from igps._arrays import Booleans, Floats, Integers, Singles
 from igps.mesh._outside import MARGIN, WALL, OrientedSurface
-from igps.mesh.surface import face_areas, sums
+from igps.mesh.surface import face_areas
 
 # Maximal exact distance: marching cubes need distances at both ends of the grid edges that cross the surface.
 _BAND = 1.1
@@ -66,18 +66,6 @@ def cell_sizes(
     min_size = max(min_size, spacing)
     default_size = max(min_size, longest / (2 * resolution))
     return default_size, min_size
-
-
-def merge_near_vertices(vertices: Floats, faces: Integers) -> Surface:
-    """Merge the vertices of each quarter of a cell, and drop degenerate and duplicate triangles."""
-    lattice = np.round(vertices * 4).astype(np.int64)
-    _, index, count = np.unique(lattice, axis=0, return_inverse=True, return_counts=True)
-    index = index.ravel()
-    # The mean of merged vertices, because lattice points would shift the surface.
-    mean = sums(index, vertices, len(count)) / count[:, None]
-    faces = np.sort(index[faces], axis=1)
-    has_three_corners = (np.diff(faces, axis=1) > 0).all(axis=1)
-    return mean, np.unique(faces[has_three_corners], axis=0)
 
 
 def distances(

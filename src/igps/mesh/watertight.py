@@ -25,7 +25,6 @@ from igps.mesh._level_set import (
     distances,
     join_pieces,
     level_set,
-    merge_near_vertices,
 )
 from igps.mesh._outside import OrientedSurface, find_outside
 from igps.mesh._tidying import are_specks, places
@@ -38,7 +37,6 @@ from igps.mesh.surface import diagonal, face_areas, face_parts, largest, longest
 # allows, and bodies below the second get a note that they are coarse.
 _FINE = 1.5
 _COARSE = 0.75
-_MAX_FACES = 400_000  # in larger meshes, vertices are first merged within quarters of a cell, to bound time and memory
 _MAX_POINTS = 200_000  # larger clouds are thinned out first
 _LINE = 1e-5  # points on a line in single precision have a smaller ratio of spread across to spread along
 
@@ -92,8 +90,6 @@ def watertight(
     default_size, min_size = cell_sizes(vertices, faces, resolution, spacing)
     grid = Grid.around(vertices, faces, min_size)
     vertices = grid.to_cells(vertices)
-    if len(faces) > _MAX_FACES:
-        vertices, faces = merge_near_vertices(vertices, faces)
     surface = OrientedSurface.of(vertices, faces)
     thickness = surface.thickness * min_size if surface.is_nearly_closed else np.inf
     cell = float(np.clip(thickness / _FINE, min_size, default_size))
