@@ -1,5 +1,7 @@
 """Files that are damaged by hand, one fault each, whose counts are known without the code that mends them."""
 
+import sys
+
 import numpy as np
 import trimesh
 from trimesh.creation import box
@@ -61,7 +63,7 @@ def write_unusable(folder):
         "triangle.off": "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
         "line.obj": "v 0 0 0\nv 1 2 3\nv 2 4 6\nv 3 6 9\nf 1 2 3\nf 2 3 4\n",
         "five.xyz": "0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 1 1\n",
-        "part.dae": "<COLLADA/>",
+        "part.step": "ISO-10303-21;",
     }
     for name, text in texts.items():
         (folder / name).write_text(text)
@@ -72,16 +74,14 @@ def write_unusable(folder):
         "triangle.off": "expected a closed surface, got a single triangle. Export it again.",
         "line.obj": "expected a surface, but no triangle has an area. Give lines some thickness.",
         "five.xyz": "expected at least 10 points for a surface, got 5. Export or scan more.",
-        "part.dae": "COLLADA, 3DXML or XAML needs a module that is not installed (No module named 'collada'). "
-        'Install it: pip install "interior-gps[formats]"; or convert the file to OFF, OBJ, PLY or STL.',
+        "part.step": "STEP needs a module that is not installed (import of cascadio halted; None in sys.modules). "
+        'Install it: pip install "interior-gps[cad]"; or convert the file to OFF, OBJ, PLY or STL.',
     }
 
 
-def without_collada(monkeypatch):
-    """What trimesh knows of COLLADA files where pycollada is not installed, wherever these tests run."""
-    error = ModuleNotFoundError("No module named 'collada'")
-    absent = trimesh.exceptions.ExceptionWrapper(error)
-    monkeypatch.setitem(trimesh.exchange.load.mesh_loaders, "dae", absent)
+def without_cascadio(monkeypatch):
+    """STEP files are those of a format whose module is missing, wherever these tests run."""
+    monkeypatch.setitem(sys.modules, "cascadio", None)
 
 
 def free_edges(path):

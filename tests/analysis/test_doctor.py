@@ -11,7 +11,7 @@ from damaged_files import (
     N_FACES,
     N_VERTICES,
     free_edges,
-    without_collada,
+    without_cascadio,
     write_box,
     write_clean,
     write_crossing,
@@ -84,7 +84,7 @@ def test_each_fault_and_what_will_be_done(tmp_path):
 
 
 def test_what_cannot_be_used_costs_the_others_nothing(tmp_path, monkeypatch):
-    without_collada(monkeypatch)
+    without_cascadio(monkeypatch)
     write_clean(tmp_path / "clean.off")
     sentences = write_unusable(tmp_path)
     found = findings(tmp_path)

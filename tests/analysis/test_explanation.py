@@ -12,11 +12,8 @@ from sklearn.metrics import roc_auc_score
 from conftest import as_mesh
 from igps.analysis.explanation import (
     explain,
-    explain_groups,
     share_density,
-    significant_cells,
     unit_shares,
-    without_head,
 )
 from igps.data.collation import collate
 from igps.descriptors import descriptor
@@ -300,63 +297,3 @@ def test_equal_bodies_have_nothing_to_share(batches):
 def test_what_knows_no_samples_is_refused(batches):
     with pytest.raises(ValueError, match=r"expected histograms of samples .*, got 'd2'"):
         explain(descriptor("d2"), *batches)
-
-
-def test_without_a_difference_one_test_in_twenty_finds_a_cell():
-    random = torch.Generator().manual_seed(0)
-    any_held = []
-    for seed in range(400):
-        groups = torch.rand(2, 12, 30, generator=random)
-        held = significant_cells(*groups, n_permutations=99, seed=seed)
-        any_held.append(bool(held.any()))
-    assert 0.02 <= np.mean(any_held) <= 0.08
-    rows = torch.rand(2, 12, 30, generator=random)
-    rows[1, :, 7] += 2
-    found = significant_cells(*rows, n_permutations=999).nonzero().flatten().tolist()
-    assert found == [7]
-
-
-def test_groups_are_explained_by_the_cells_that_are_held(batches):
-    chosen = descriptor("interior")
-    rows = torch.cat([chosen(batch) for batch in batches]).flatten(1)
-    noise = 1 + 0.05 * torch.rand(2, 8, rows.shape[1], generator=torch.Generator().manual_seed(1))
-    groups = rows[:, None] * noise
-    found, kept = explain_groups(
-        chosen,
-        groups[0],
-        groups[1],
-        batches,
-        n_permutations=199,
-    )
-    assert 0 < kept.sum() < len(kept)
-    means = groups.double().mean(dim=1)
-    terms = (means[0] - means[1]) ** 2 / (means[0] + means[1]).clamp_min(1e-300) / 2
-    expected = pytest.approx(
-        float(terms[kept].sum()),
-        rel=1e-6,
-    )
-    assert found.distance == expected
-    with pytest.raises(ValueError, match="3 and 3 bodies can be arranged in only 10 ways"):
-        explain_groups(
-            chosen,
-            groups[0, :3],
-            groups[1, :3],
-            batches,
-        )
-
-
-def test_groups_that_differ_in_size_alone_differ_in_size(batches):
-    chosen = descriptor("interior+side+size")
-    with torch.no_grad():
-        contents = without_head(chosen)(batches[0]).repeat(16, 1)
-    contents[:, -2:] += torch.randn(16, 2, generator=torch.Generator().manual_seed(0)) / 100
-    contents[8:, -2:] += 3
-    found, kept = explain_groups(
-        chosen, contents[:8], contents[8:], [batches[0]] * 2, n_permutations=199
-    )
-    expected = [len(kept) - 2, len(kept) - 1]
-    assert kept.nonzero().flatten().tolist() == expected
-    assert found.parts["size"] == pytest.approx(found.distance)
-    means = contents.view(2, 8, -1).mean(dim=1)
-    expected = pytest.approx(float(chosen.distances(means[:1], means[1:])))
-    assert found.distance == expected

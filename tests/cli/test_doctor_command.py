@@ -8,7 +8,7 @@ from commands import run
 from damaged_files import (
     N_FACES,
     N_VERTICES,
-    without_collada,
+    without_cascadio,
     write_box,
     write_clean,
     write_holed,
@@ -58,7 +58,7 @@ def test_table_and_file_of_a_folder_that_can_be_used(tmp_path, capsys):
 
 
 def test_status_is_1_if_a_file_cannot_be_used(tmp_path, monkeypatch, capsys):
-    without_collada(monkeypatch)
+    without_cascadio(monkeypatch)
     root = tmp_path / "meshes"
     out = tmp_path / "doctor.csv"
     write_clean(root / "clean.off")

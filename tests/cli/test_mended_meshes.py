@@ -10,7 +10,7 @@ from commands import run
 from damaged_files import (
     N_FACES,
     N_VERTICES,
-    without_collada,
+    without_cascadio,
     write_box,
     write_clean,
     write_holed,
@@ -165,7 +165,7 @@ def test_the_commands_that_read_no_meshes():
 def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
     command, tmp_path, monkeypatch, capsys, caplog
 ):
-    without_collada(monkeypatch)
+    without_cascadio(monkeypatch)
     root = tmp_path / "meshes"
     out = tmp_path / "out"
     for label, height in (("ball", 1.0), ("egg", 2.0)):

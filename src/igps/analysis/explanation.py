@@ -1,7 +1,6 @@
 """Explanation of the distance of two bodies: shares of the parts of their descriptions and of their samples."""
 
 import copy
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -43,13 +42,13 @@ class Explanation:
     parts: Mapping[str, float]
     # Shares (P,) of the samples of each kind in the first and in the second body; all together sum to the distance
     samples: tuple[Shares, Shares]
-    # As `samples`, but non-negative and by weights or local dissimilarity, see `explain`; None for groups
-    places: tuple[Shares, Shares] | None = None
+    # As `samples`, but non-negative and by weights or local dissimilarity, see `explain`
+    places: tuple[Shares, Shares]
 
     def summary(self) -> str:
         """Return the three largest shares of histograms as text."""
         if not self.distance:
-            return "no significant difference" if self.places is None else "identical"
+            return "identical"
         by_size = sorted(self.parts.items(), key=lambda item: -abs(item[1]))
         largest = by_size[:3]
         return ", ".join(f"{share / self.distance:.0%} {name}" for name, share in largest)
@@ -335,91 +334,3 @@ def part_name(part: DescriptionPart) -> str:
             words.append(word)
     samples = f" ({part.samples})" if isinstance(part, SampleHistogram) else ""
     return " and ".join(words) + samples
-
-
-def significant_cells(
-    one: Tensor, other: Tensor, *, level: float = 0.05, n_permutations: int = 1000, seed: int = 0
-) -> Tensor:
-    """Test in which cells the means of two groups differ significantly.
-
-    This is a permutation test of the largest standardised difference of means (Westfall and Young 1993).
-
-    Args:
-        one, other: (N, cells) square roots of histograms of two groups.
-        level: family-wise error rate.
-        n_permutations: number of random assignments of the bodies to the groups.
-        seed: seed of the permutations.
-
-    Returns:
-        (cells,) whether the means differ significantly.
-    """
-    n = len(one)
-    rows = torch.cat([one, other]).double()
-    rows = rows - rows.mean(dim=0)
-    scale = rows.std(dim=0)
-    rows = torch.where(scale > 1e-12, rows / scale.clamp_min(1e-12), 0)
-    # Each row of contrasts is an assignment to the groups; the first is the given one.
-    contrasts = torch.full((n_permutations + 1, len(rows)), -1 / len(other), dtype=torch.float64)
-    contrasts[0, :n] = 1 / n
-    random = torch.Generator().manual_seed(seed)
-    for contrast in contrasts[1:]:
-        chosen = torch.randperm(len(rows), generator=random)[:n]
-        contrast[chosen] = 1 / n
-    differences = (contrasts @ rows).abs()
-    largest = differences.max(dim=1).values
-    return differences[0] > largest.quantile(1 - level)
-
-
-def explain_groups(
-    descriptor: Descriptor,
-    one: Tensor,
-    other: Tensor,
-    batches: Sequence[SignatureBatch],
-    **test: Any,
-) -> tuple[Explanation, Tensor]:
-    """Divide the distance of the mean descriptions of two groups among histograms, and among samples of two bodies.
-
-    Only cells that differ significantly have shares, see `significant_cells`; the distance is the sum of these shares.
-    Shares of samples sum to this distance only if the descriptions of both bodies are the means of their groups.
-
-    Args:
-        descriptor: see `explain`.
-        one, other: (N, ...) contents of the bodies of each group, see `without_head`.
-        batches: two bodies whose samples receive shares, one of each group.
-        test: options of `significant_cells`.
-
-    Returns:
-        The explanation, and (cells,) whether the means differ significantly.
-
-    Raises:
-        ValueError: too few bodies for a test.
-    """
-    level = test.get("level", 0.05)
-    n = len(one)
-    m = len(other)
-    n_ways = math.comb(n + m, n)
-    if n == m:
-        n_ways //= 2  # exchanging groups of equal size changes no difference
-    if n_ways * level <= 1:
-        raise ValueError(
-            f"one, other: {n} and {m} bodies can be arranged in only {n_ways} ways, too few for a test at the level "
-            f"{level}. Add bodies, or explain one of each."
-        )
-    descriptor = copy.deepcopy(descriptor).double().eval()
-    one = one.double().flatten(1)
-    other = other.double().flatten(1)
-    n_cells = _n_cells(descriptor)
-    is_significant = significant_cells(
-        _with_roots(one, n_cells), _with_roots(other, n_cells), **test
-    )
-    mean = one.mean(dim=0)
-    other_mean = other.mean(dim=0)
-    all_units, _ = unit_shares(descriptor, mean, other_mean)
-    units = torch.where(is_significant, all_units, 0)
-    shares = units * (mean - other_mean)
-    parts = _part_shares(descriptor, shares)
-    for batch in batches:
-        Requirements().check(batch)  # samples of both kinds receive shares
-    weighted = [_with_weights(batch) for batch in batches]
-    samples = _sample_shares(descriptor, weighted, units, shares)
-    return Explanation(sum(parts.values()), parts, samples), is_significant

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,7 +44,7 @@ def explain(
         body: of a folder, only the bodies of this name in their files, such as an organ.
         axis: of a folder, the two bodies at the ends of axis 1 or 2 of its map, see igps clusters, between which its
             bodies vary most; without groups.
-        level: family-wise error rate, for two groups: only histogram cells and places that differ significantly count.
+        level: family-wise error rate, for two groups: the places where they do not differ significantly are pale.
         out: folder for explain.csv (shares of the histograms), explain_samples.csv (shares of the samples), and
             explain.svg and explain.png: two bodies painted with their shares, or the mean difference of two groups;
             the same for viewers as explain_BODY.ply, .vtk, .gii and .nii.gz; of each attribute of --with also
@@ -186,12 +186,15 @@ def _explain_pair(result: Described, pair: list[int], descriptor: str) -> _Expla
     from igps.descriptors.with_attributes import split_attributes
     from igps.mesh.surface import vertex_areas
 
-    dataset = result.dataset.subset(pair)
-    moved = movement(*dataset.bodies)
+    dataset = result.dataset
+    both = dataset.subset(pair)
+    moved = movement(*both.bodies)
     form, attributes = split_attributes(result.descriptor)
-    explanation = explain_bodies(form, dataset, moved)
-    places = explanation.places or explanation.samples
-    painted = [_painted(dataset, i, places[i], explanation.distance) for i in (0, 1)]
+    explanation = explain_bodies(form, both, moved)
+    painted = [
+        _painted(dataset, i, places, explanation.distance)
+        for i, places in zip(pair, explanation.places, strict=True)
+    ]
     meaning = _meaning(descriptor, dataset, explanation.distance)
     lines = [meaning or f"what this distance means is known for {CALIBRATED} alone"]
     if moved is not None:
@@ -199,67 +202,47 @@ def _explain_pair(result: Described, pair: list[int], descriptor: str) -> _Expla
     for body in painted:
         areas = vertex_areas(body.mesh.vertices, body.mesh.faces)
         lines.append(f"{body.name}: {_extent(body.values, areas)}")
-    one, other = (collate([item.signature]) for item in dataset)  # with all samples
+    one, other = (collate([item.signature]) for item in both)  # with all samples
     told = {name: explain_pair(added, one, other) for name, added in attributes.items()}
     return _Explained(
-        form.name, dataset, [0, 1], explanation, painted, _LEGEND, lines, told, moved, meaning
+        form.name, dataset, pair, explanation, painted, _LEGEND, lines, told, moved, meaning
     )
 
 
 def _explain_groups(folder: Folder, descriptor: str, level: float, **describing: Any) -> _Explained:
-    """Return the medoids of two groups, and their mean difference, painted on the body nearest to the mean."""
+    """Explain the medoids of two groups, but paint the mean difference, on the body nearest to the mean."""
     import numpy as np
 
     from igps.analysis.dissimilarity import REQUIREMENTS
-    from igps.analysis.explanation import explain as explain_pair
-    from igps.analysis.explanation import explain_groups, without_head
     from igps.analysis.groups import squared_distances
     from igps.cli.places import places_of_groups
     from igps.cli.reading import described
-    from igps.data.collation import collate
-    from igps.descriptors.fingerprint import cache_tag
     from igps.descriptors.size_and_side import SIZE
-    from igps.descriptors.with_attributes import split_attributes
-    from igps.nn.description import describe
 
     result = described(folder, descriptor, **describing, also=REQUIREMENTS)
     dataset = result.dataset
     assert folder.check is not None
     labels: Any = folder.check(dataset.bodies)  # without the bodies that could not be used
     _print_kinds(dataset, folder.body)
-    form, attributes = split_attributes(result.descriptor)
-    inner = without_head(form)
-    n_workers = describing.get("n_workers")
-    descriptions = describe(
-        dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True
-    )
-    members = [np.flatnonzero(labels == name) for name in sorted(set(labels))]
-    squares = squared_distances(inner.coordinates(descriptions).double().numpy())
-    # The medoids
-    pair = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]
-    one, other = (collate([dataset[i].signature]) for i in pair)  # with all samples
-    first, second = (descriptions[own] for own in members)
-    explanation, is_significant = explain_groups(form, first, second, [one, other], level=level)
-    n_cells = f"{int(is_significant.sum())} of {len(is_significant)}"
-    print(f"{n_cells} cells differ significantly; their samples: in the medoid of each group")
+    coordinates = result.coordinates()
+    squares = squared_distances(coordinates)
+    medoids = []
+    for name in sorted(set(labels)):
+        own = np.flatnonzero(labels == name)
+        sums = squares[np.ix_(own, own)].sum(axis=1)
+        medoids.append(int(own[sums.argmin()]))
+    found = _explain_pair(result, medoids, descriptor)
     places = places_of_groups(
         dataset,
         range(len(dataset)),
-        result.coordinates(),
+        coordinates,
         labels.tolist(),
         keep_size=SIZE in result.descriptor.name,
-        n_workers=n_workers,
+        n_workers=describing.get("n_workers"),
         level=level,
     )
-    return _Explained(
-        form.name,
-        dataset,
-        pair,
-        explanation,
-        [places.painted],
-        places.legend,
-        [places.words],
-        {name: explain_pair(added, one, other) for name, added in attributes.items()},
+    return replace(
+        found, painted=[places.painted], legend=places.legend, lines=[places.words], moved=None
     )
 
 
@@ -365,9 +348,9 @@ def _part_rows(explanation: Explanation) -> list[dict[str, Any]]:
 
 def _sample_rows(found: _Explained) -> list[dict[str, Any]]:
     explanation = found.explanation
-    by_place = explanation.places or explanation.samples
+    columns_of = zip(found.pair, explanation.samples, explanation.places, strict=True)
     rows = []
-    for i, shares, places in zip(found.pair, explanation.samples, by_place, strict=True):
+    for i, shares, places in columns_of:
         signature = found.dataset[i].signature
         for kind, values in shares.items():
             columns = {"share": values, "share_by_place": places[kind]}

@@ -17,7 +17,7 @@ from igps.fields.molecules.residue_attributes import (
     residue_means,
     screened_potential,
 )
-from igps.fields.molecules.residues import HYDROPATHY, VOLUMES
+from igps.fields.molecules.residues import HYDROPATHY
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import SignatureConfig, compute_signature
 
@@ -65,8 +65,6 @@ def means_written_out(molecule, values):
     [
         ("charge", lambda name: CHARGES.get(name, 0.0)),
         ("hydropathy", HYDROPATHY.__getitem__),
-        ("residue_volume", VOLUMES.__getitem__),
-        ("aromaticity", lambda name: float(name in ("PHE", "TYR", "TRP", "HIS"))),
         ("donors", lambda name: {"ARG": 3, "LYS": 1, "HIS": 1, "TRP": 1}.get(name, 0)),
         ("acceptors", lambda name: {"ASP": 2, "GLU": 2, "HIS": 1}.get(name, 0)),
     ],

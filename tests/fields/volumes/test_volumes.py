@@ -3,7 +3,6 @@
 import gzip
 import json
 import re
-import struct
 import tracemalloc
 from pathlib import Path
 
@@ -371,30 +370,6 @@ def test_segments_of_slicer_have_names_and_may_overlap(tmp_path):
     assert label_surface(volume, "body").volume == expected
 
 
-def test_groups_of_labels_of_mitk_have_names_and_may_overlap(tmp_path):
-    liver = (two_boxes() == 3) * 1
-    others = (two_boxes() > 0) * 2 + (two_boxes() == 7)
-    image = itk_image(
-        np.stack([liver, others], axis=-1).astype(np.uint16),
-        vector=True,
-    )
-    groups = [
-        {"labels": [{"name": "liver", "value": 1, "opacity": 0.6}]},
-        {"labels": [{"name": "left", "value": 2}, {"name": "right", "value": 3}]},
-        {"labels": None},
-    ]
-    image.SetMetaData("modality", "org.mitk.multilabel.segmentation")
-    image.SetMetaData("org.mitk.multilabel.segmentation.labelgroups", json.dumps(groups))
-    sitk.WriteImage(image, str(tmp_path / "x.nrrd"))
-    bodies = label_bodies(read_label_volume(tmp_path / "x.nrrd"))
-    expected = [
-        (1, "liver", 384),
-        (2, "left", 384),
-        (3, "right", 320),
-    ]
-    assert bodies == expected
-
-
 def test_segments_of_slicer_before_4_11_each_have_a_layer(tmp_path):
     """It wrote no values and no layers; names are on one line, as in every table."""
     layers = np.stack(
@@ -535,50 +510,6 @@ def test_names_come_from_the_header_and_a_given_table_goes_first(tmp_path):
     (tmp_path / "names.csv").write_text("label,name\n7,spleen\n")
     given = read_label_volume(tmp_path / "x.nii.gz", LoadOptions(names=str(tmp_path / "names.csv")))
     assert [body.name for body in given.bodies] == ["3", "spleen"]
-
-
-def mgh_tags(names, n_names=None):
-    """What FreeSurfer puts behind the voxels: a transform, a colour table, and the command that made the file."""
-    table = struct.pack(">iii", -2, max(names) + 1, 8) + b"LUT.txt\0"
-    table += struct.pack(">i", n_names or len(names))
-    for label, name in names.items():
-        table += struct.pack(">ii", label, len(name) + 1) + name
-        table += struct.pack(">x4i", 220, 20, 60, 0)
-    transform, command = b"talairach.xfm\0", b"mri_convert\0"
-    tags = struct.pack(">iq", 31, len(transform)) + transform + struct.pack(">i", 1) + table
-    return tags + struct.pack(">iq", 3, len(command)) + command
-
-
-@pytest.mark.parametrize("kind", ["mgh", "mgz"])
-def test_an_mgh_file_has_names_in_its_colour_table(kind, tmp_path):
-    path = tmp_path / f"x.{kind}"
-    write_nibabel(path, two_boxes())
-    opened = gzip.open if kind == "mgz" else open
-    content = opened(path, "rb").read()
-
-    def names(tags):
-        with opened(path, "wb") as file:
-            file.write(content + tags)
-        return [body.name for body in read_label_volume(path).bodies]
-
-    given = {0: b"Unknown", 3: b"Left-Hippocampus", 7: "Corne d’Ammon".encode()}
-    assert names(mgh_tags(given)) == ["Left-Hippocampus", "Corne d’Ammon"]
-    assert (
-        names(b"")
-        == names(struct.pack(">i", 1))
-        == names(struct.pack(">iq", 31, 2**62))
-        == ["3", "7"]
-    )
-    found = names(struct.pack(">iq", 31, -5) + bytes(99))
-    assert found == ["3", "7"]
-    # A table that is cut short, or announces more than there is, gives what it has
-    for n_names in (2**31 - 1, -1):
-        assert len(names(mgh_tags(given, n_names))) == 2
-    for n in range(0, len(mgh_tags(given)), 7):
-        assert len(names(mgh_tags(given)[:n])) == 2
-    (tmp_path / "x.csv").write_text("label,name\n3,liver\n")
-    assert names(mgh_tags(given)) == ["Left-Hippocampus", "Corne d’Ammon"]
-    assert names(b"") == ["liver", "7"]
 
 
 def test_a_mask_without_names_is_called_by_its_file(tmp_path):

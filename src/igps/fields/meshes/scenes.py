@@ -1,7 +1,6 @@
-"""Scenes: GLB, glTF, COLLADA, 3DXML and XAML. An object is a node of the scene with a geometry."""
+"""Scenes: GLB and glTF. An object is a node of the scene with a geometry."""
 
 import json
-import zipfile
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,17 +18,6 @@ _OF_MATERIALS = ("KHR_materials_", "KHR_texture_", "EXT_texture_")
 _HARMLESS = ("KHR_lights_punctual", "KHR_mesh_quantization", "KHR_xmp_json_ld")
 _FAN = 6  # the mode of fans of triangles
 _MAX_ITEM = 64  # bytes of the largest item of an array, a 4 × 4 matrix
-
-
-def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    from igps.fields.meshes._trimesh import objects
-
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            check_unpacked(
-                sum(info.file_size for info in archive.infolist()), path, options.max_unpacked
-            )
-    return objects(path, options)
 
 
 def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -125,8 +113,4 @@ def _buffers(path: Path, options: LoadOptions) -> list[Path]:
     ]
 
 
-GLTF = Format("glTF", (".glb", ".gltf"), read_gltf, bodies=("whole", "objects"), beside=_buffers)
-_SUFFIXES = (".dae", ".zae", ".3dxml", ".xaml")
-OTHERS = Format(
-    "COLLADA, 3DXML or XAML", _SUFFIXES, read, bodies=("whole", "objects"), extra="formats"
-)
+FORMAT = Format("glTF", (".glb", ".gltf"), read_gltf, bodies=("whole", "objects"), beside=_buffers)

@@ -16,7 +16,7 @@ from igps._parameters import check_one_of
 from igps.data.attribute_sources import fill_missing
 from igps.fields.molecules.bodies import molecule_of
 from igps.fields.molecules.molecule import Molecule
-from igps.fields.molecules.residues import ACCEPTORS, AROMATIC, DONORS, HYDROPATHY, VOLUMES
+from igps.fields.molecules.residues import ACCEPTORS, DONORS, HYDROPATHY, VOLUMES
 from igps.fields.molecules.structures import is_structure
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef
@@ -162,8 +162,6 @@ _COLUMNS: Mapping[str, Callable[[Molecule], Floats]] = {
     "b_factor": lambda molecule: molecule.b_factors[:, None],  # Å², or pLDDT
     "donors": _by_name(DONORS, 0.0),  # numbers of hydrogen bond donors of the side chain
     "acceptors": _by_name(ACCEPTORS, 0.0),
-    "aromaticity": _by_name(dict.fromkeys(AROMATIC, 1.0), 0.0),  # 1 for amino acids with a ring
-    "residue_volume": _by_name(VOLUMES),  # Å³, Zamyatnin 1972
     "residue_shares": _kinds,  # shares of `RESIDUE_KINDS`, which sum to 1
 }
 

@@ -76,9 +76,6 @@ DONORS = {"ARG": 3, "ASN": 1, "GLN": 1, "HIS": 1, "LYS": 1, "SER": 1, "THR": 1, 
 ACCEPTORS = {"ASN": 1, "ASP": 2, "GLN": 1, "GLU": 2, "HIS": 1, "SER": 1, "THR": 1, "TYR": 1}
 """Number of side-chain atoms that accept hydrogen bonds; 0 for other amino acids."""
 
-AROMATIC = frozenset({"HIS", "PHE", "TRP", "TYR"})
-"""Residues with an aromatic ring."""
-
 STANDARD = {
     "ASH": "ASP",
     "CYM": "CYS",

@@ -1,7 +1,6 @@
 """Readers of volume files by nibabel, SimpleITK, highdicom and tifffile; sizes are checked before voxels are read."""
 
 import gzip
-import json
 import math
 import re
 import tempfile
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from igps._arrays import Floats
 from igps.fields.volumes._streams import check_gzip, check_rest, check_zlib
-from igps.fields.volumes.label_names import names_in_extensions, names_in_tags
+from igps.fields.volumes.label_names import names_in_extensions
 from igps.mesh.errors import MeshError
 from igps.mesh.limits import check_fits
 from igps.mesh.mesh import Frame, unit_of_length
@@ -27,10 +26,8 @@ _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # DICOM and ITK use LPS
 _EXPORT = "Export the labels."
 _NRRD = (".nrrd", ".nhdr")
 _META = (".mha", ".mhd")
-_MITK = "org.mitk.multilabel.segmentation.labelgroups"
 _NIFTI_UNITS = {1: 1e3, 2: 1.0, 3: 1e-3}  # metres, millimetres, micrometres, in millimetres
 _MAX_HEADER = 1 << 24  # bytes
-_MGH_FOOTER = 20  # bytes between voxels and tags
 _MAX_TAGS = 1 << 26  # bytes around the voxels of a compressed NIfTI or MGH file
 # Spacings closer than this, as a share, differ by the rounding of a header.
 _SPACING_TOLERANCE = 0.01
@@ -174,12 +171,6 @@ def _volume_of(image: Any) -> RawVolume:
             else str(x.get_content()).encode()
             for x in image.header.extensions
         )
-    elif isinstance(image, nibabel.MGHImage) and image.file_map["image"].filename:
-        with image.file_map["image"].get_prepare_fileobj(
-            "rb"
-        ) as file:  # nibabel does not read the tags
-            file.seek(image.header.get_footer_offset() + _MGH_FOOTER)
-            names = names_in_tags(file.read(_MAX_HEADER))
     return RawVolume([values], affine, names, notes=notes, frame=frame, unit_from=source)
 
 
@@ -330,7 +321,7 @@ def _leave_without_unit(volume: RawVolume, spacing: str) -> None:
 
 
 def _segments(metadata: dict[str, str]) -> list[tuple[str, int, int]]:
-    """Return (name, layer, value) of the segments that 3D Slicer or MITK lists in a NRRD header."""
+    """Return (name, layer, value) of the segments that 3D Slicer lists in a NRRD header."""
     segments = []
     matches = (re.fullmatch(r"Segment(\d+)_(?:Name|LabelValue)", key) for key in metadata)
     for number in sorted({match[1] for match in matches if match}, key=int):
@@ -340,10 +331,6 @@ def _segments(metadata: dict[str, str]) -> list[tuple[str, int, int]]:
         if not value or value.isdigit():
             name = metadata.get(f"Segment{number}_Name", "")
             segments.append((name, int(layer) if layer.isdigit() else 0, int(value or 1)))
-    for index, group in enumerate(json.loads(metadata.get(_MITK, "[]"))):
-        segments += [
-            (label.get("name", ""), index, int(label["value"])) for label in group["labels"] or ()
-        ]
     return segments
 
 

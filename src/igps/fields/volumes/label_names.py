@@ -1,4 +1,4 @@
-"""Names of labels, from tables of ITK-SNAP, 3D Slicer, FreeSurfer, FSLeyes and nnU-Net, CSV, and NIfTI or MGH files.
+"""Names of labels, from tables of ITK-SNAP, 3D Slicer, FreeSurfer, FSLeyes and nnU-Net, CSV, and NIfTI files.
 
 The tables in `label_tables` name the labels of FreeSurfer 7 and of FastSurfer, which has the same numbers, by
 FreeSurferColorLUT.txt, and those of TotalSegmentator, version 2 and version 1, task "total".
@@ -6,7 +6,6 @@ FreeSurferColorLUT.txt, and those of TotalSegmentator, version 2 and version 1, 
 
 import csv
 import html
-import io
 import json
 import logging
 import re
@@ -33,7 +32,6 @@ _FSLEYES = re.compile(r"(\d+)(?:\s+[\d.]+){3}\s+(?![\d.\s]*$)(.+)")
 _COLOURS = re.compile(r'(\d+)\s+("[^"]*"|\S+)(?:\s+[\d.]+){3,4}')
 _WORKBENCH = re.compile(rb"<Label\b([^>]*)>(.*?)</Label>", re.DOTALL)
 _KEY = re.compile(rb"""\bKey\s*=\s*["'](\d+)["']""")
-_COLOUR_TABLE, _NEW_LAYOUT = 1, -2  # a tag of an MGH file, and the version of the table behind it
 
 
 def read_label_names(path: str | Path) -> dict[int, str]:
@@ -112,32 +110,6 @@ def names_in_extensions(contents: Iterable[bytes]) -> dict[int, str]:
             if key := _KEY.search(attributes):
                 inner = re.sub(rb"<!\[CDATA\[(.*?)\]\]>", rb"\1", name, flags=re.DOTALL)
                 names[int(key[1])] = html.unescape(inner.decode("utf-8", "replace"))
-    return cleaned(names)
-
-
-def names_in_tags(content: bytes) -> dict[int, str]:
-    """Return the names of labels of the colour table in the tags at the end of an MGH file, as FreeSurfer writes it.
-
-    Numbers are big-endian. Behind each tag stand the size and the content, behind the colour table's only the content.
-    """
-    stream = io.BytesIO(content)
-
-    def read_number(size: int = 4) -> int:
-        return int.from_bytes(stream.read(size), "big", signed=True)  # 0 at the end
-
-    def read_bytes() -> bytes:
-        return stream.read(max(read_number(), 0))
-
-    while (tag := read_number()) not in (0, _COLOUR_TABLE):
-        stream.seek(min(max(read_number(8), 0), len(content)), io.SEEK_CUR)
-    names: dict[int, str] = {}
-    if tag and read_number() == _NEW_LAYOUT:
-        read_number(), read_bytes()  # the largest label, the path of the table
-        for _ in range(min(read_number(), len(content) // 24)):  # an entry takes at least 24 bytes
-            label = read_number()
-            name = read_bytes()
-            names[label] = name.rstrip(b"\0").decode("utf-8", "replace")
-            stream.read(16)  # red, green, blue and transparency
     return cleaned(names)
 
 

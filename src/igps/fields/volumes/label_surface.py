@@ -16,7 +16,6 @@ from scipy import ndimage
 from igps._arrays import Booleans, Floats, Integers, Singles, Surface
 from igps._text import counted
 from igps.fields.volumes._label_field import PAD, filled_volume, smooth_field
-from igps.fields.volumes._label_gaps import TOUCHING, fill_missed_slices
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles, join_pieces
 from igps.mesh.errors import MeshError, NoBodyError
 from igps.mesh.isosurface import level_surface, restore_volume, simplify_surface
@@ -36,6 +35,7 @@ class TooFewVoxelsError(NoBodyError):
     summary = f"of fewer than {MIN_VOXELS} voxels"
 
 
+_TOUCHING = np.ones((3, 3, 3), dtype=bool)  # voxels that share a corner are connected
 _ISLAND = 0.02  # separate pieces of less than this share of the voxels are dropped
 _MIN_OPEN_CAVITY = 0.1  # share of the voxels from which an open cavity is noted
 _SPECK = 0.005  # pieces of the surface of less than this share of the volume are artefacts between voxels
@@ -76,8 +76,7 @@ def voxel_surface(
         affine: (4, 4) from voxel indices to world coordinates; may shear and mirror. None for voxels of side 1.
         max_vertices: approximate maximal number of vertices.
         cavities: keep hollows of at least `MIN_VOXELS` voxels; they get surfaces that are oriented inward.
-        joins: join separate pieces: up to three missed slices between them are filled, and wider gaps are bridged by
-            bars where they are narrowest.
+        joins: join separate pieces by bars where the gaps are narrowest.
         name: name of the body in error messages.
         unit: unit of length of the world, for notes.
 
@@ -101,7 +100,7 @@ def voxel_surface(
     (box,) = ndimage.find_objects(mask.view(np.uint8))
     low = np.array([side.start for side in box], dtype=np.float64)
     notes: list[str] = []
-    mask = fill_missed_slices(mask[box], notes) if joins else mask[box]
+    mask = mask[box]
     voxel = Voxel(abs(float(np.linalg.det(matrix[:3, :3]))), unit)
     mask, hollows = _clean(mask, notes, MIN_VOXELS if cavities else None, name, voxel)
     n_open = _n_nearly_enclosed(mask) if cavities else 0
@@ -210,14 +209,14 @@ def _clean(
 
 def _n_nearly_enclosed(mask: Booleans) -> int:
     """Count the voxels outside a body that it encloses if it is thickened by one voxel."""
-    label, _ = ndimage.label(~ndimage.binary_dilation(np.pad(mask, 2), TOUCHING))
+    label, _ = ndimage.label(~ndimage.binary_dilation(np.pad(mask, 2), _TOUCHING))
     size = np.bincount(label.reshape(-1))
     return int(size[1:].sum() - size[label[0, 0, 0]])
 
 
 def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
     """Return the piece of each voxel, from 1; the pieces too small to keep; and the number of voxels of each piece."""
-    label, _ = ndimage.label(mask, TOUCHING)
+    label, _ = ndimage.label(mask, _TOUCHING)
     size = np.bincount(label.reshape(-1))
     size[0] = 0
     return label, np.nonzero(size < _ISLAND * size.sum())[0][1:], size
@@ -263,7 +262,7 @@ def _coarsen(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Single
 
     share = mask.astype(np.float32)
     factor = np.ones(3, dtype=np.int64)
-    n_pieces = ndimage.label(mask, TOUCHING)[1]
+    n_pieces = ndimage.label(mask, _TOUCHING)[1]
     while _n_vertices(mask, spacing * factor) > _MAX_SURPLUS * max_vertices:
         sides = spacing * factor
         is_halved = sides < 1.5 * sides.min()

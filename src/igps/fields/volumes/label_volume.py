@@ -145,9 +145,9 @@ class LabelVolume:
 def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) -> LabelVolume:
     """Read a label volume: `.nii`, `.nii.gz`, `.mgh`, `.mgz`, `.nrrd`, `.nhdr`, `.mha`, `.mhd`, `.dcm` (SEG), `.tif`.
 
-    Names of labels come from the table `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, NIfTI extensions,
-    MGH tags), else from a table beside it (see `table_beside`). The only label of a mask, 1 or 255, is then named after
-    the file. Other labels are named by the built-in table that `options.names` tells, or else by their numbers.
+    Names of labels come from the table `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, NIfTI extensions),
+    else from a table beside it (see `table_beside`). The only label of a mask, 1 or 255, is then named after the file.
+    Other labels are named by the built-in table that `options.names` tells, or else by their numbers.
 
     Raises:
         MeshError: the file is missing, cut short, too large, or holds no labels.
