@@ -1,6 +1,7 @@
 """Files that hold several bodies: found by name, computed together, and one fault costs no other body its Signature."""
 
 import os
+from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import nibabel
@@ -380,7 +381,7 @@ def test_a_folder_for_each_subject(tmp_path):
     assert sorted(labels) == ["1", "1", "1", "2", "2"]
 
 
-def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(
+def test_empty_masks_are_told_in_one_line_and_read_once(
     tmp_path, caplog, trust_recent_files, monkeypatch
 ):
     root = tmp_path / "masks"
@@ -398,7 +399,16 @@ def test_empty_masks_are_told_in_one_line_and_no_file_is_read_again(
         failures = dataset.precompute(n_workers=1, progress=False)
         return len(failures), [record.getMessage() for record in caplog.records]
 
+    n_read = Counter()
+    load = nibabel.load
+
+    def counted(path):
+        n_read[path.name] += 1
+        return load(path)
+
     expected = 4, ["4 masks left out: 3 empty, 1 of fewer than 8 voxels"]
+    monkeypatch.setattr(nibabel, "load", counted)
     assert run() == expected
+    assert [n_read[f"rib_{i}.nii.gz"] for i in (1, 2, 3)] == [1, 1, 1]
     monkeypatch.setattr(nibabel, "load", lambda path: pytest.fail(f"{path} is read again"))
     assert run() == expected

@@ -9,11 +9,12 @@ from pathlib import Path
 from igps.data.cache import Cache, Record
 from igps.data.keys import Content, derived_key
 from igps.data.known_files import KnownFiles
-from igps.data.pipeline import version
+from igps.data.pipeline import SignaturePipeline, version
 from igps.mesh.errors import MeshError, NoBodyError
 from igps.mesh.formats import dependencies_of
 from igps.mesh.loading import BodyRef, is_one_body, list_bodies
 from igps.mesh.options import LoadOptions
+from igps.signature.config import SignatureConfig
 
 
 @dataclass(frozen=True)
@@ -55,17 +56,22 @@ class Listing:
         texts = cache.texts(key)
         if texts is not None:
             return [BodyRef(path, part, number) for part, number in json.loads(texts["bodies"])]
-        bodies, is_sound = _read(path, self.options)
-        if is_sound:
+        bodies, nothing = _read(path, self.options)
+        if isinstance(nothing, NoBodyError):
+            pipeline = SignaturePipeline(
+                SignatureConfig(), self.options, self.cache_dir, needs_cache=False
+            )
+            pipeline.remember(bodies[0], content, nothing)  # it need not be read once more
+        if nothing is None or isinstance(nothing, NoBodyError):
             rows = json.dumps([(body.part, body.number) for body in bodies])
             with contextlib.suppress(OSError):  # a folder that cannot be written is reported later
                 cache.put(key, Record({}, {"bodies": rows}))
         return bodies
 
 
-def _read(path: Path, options: LoadOptions) -> tuple[list[BodyRef], bool]:
-    """Return the bodies of a file, and whether that is certain: it is not if reading failed."""
+def _read(path: Path, options: LoadOptions) -> tuple[list[BodyRef], MeshError | None]:
+    """Return the bodies of a file, or the file itself and the error if it could not be read."""
     try:
-        return list_bodies(path, options) or [BodyRef(path)], True
+        return list_bodies(path, options) or [BodyRef(path)], None
     except MeshError as error:
-        return [BodyRef(path)], isinstance(error, NoBodyError)
+        return [BodyRef(path)], error
