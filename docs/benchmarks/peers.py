@@ -317,7 +317,7 @@ def run_adrenals(
     torch.set_num_threads(1)
     paths = sorted(root.glob("*/*/*.nii.gz"))
     labels = [path.parts[-2] for path in paths]
-    dataset = _dataset(paths, cache_dir, labels)
+    dataset = _dataset(paths, cache_dir, methods, labels)
     train = [i for i, path in enumerate(paths) if path.parts[-3] == "train"]
     test = [i for i, path in enumerate(paths) if path.parts[-3] == "val"]
     task = Task(dataset, train, test, n_steps)
@@ -339,7 +339,7 @@ def run_held_out(
 ) -> None:
     """Ask for each body of a folder after training on other folds, by default on all others, and print scores."""
     torch.set_num_threads(1)
-    dataset = _dataset(root, cache_dir)
+    dataset = _dataset(root, cache_dir, methods)
     labels = dataset.labels.numpy()
     everyone = Task(dataset, [], list(range(len(dataset))))
     for name in methods:
@@ -382,7 +382,8 @@ def run_collection(
 ) -> None:
     """Train on a few bodies of each class, and print how many of those beyond ten of a class are recognised."""
     torch.set_num_threads(1)
-    _few_labels(_dataset(root, cache_dir), split_classes, methods, seeds, labels, n_steps)
+    dataset = _dataset(root, cache_dir, methods)
+    _few_labels(dataset, split_classes, methods, seeds, labels, n_steps)
 
 
 def _few_labels(
@@ -437,12 +438,13 @@ def split_classes(
 
 
 def _dataset(
-    root: Path | list[Path], cache_dir: Path, labels: list[str] | None = None
+    root: Path | list[Path], cache_dir: Path, methods: list[str], labels: list[str] | None = None
 ) -> igps.SignatureDataset:
     """Return a collection with all that the methods need, after its signatures are computed."""
     needed = igps.descriptor("interior").requirements | igps.descriptor("pretrained").requirements
     dataset = igps.SignatureDataset(root, descriptor=needed, cache_dir=cache_dir, labels=labels)
-    dataset.precompute(strict=True, n_workers=1)
+    if methods != ["resnet"]:  # which reads meshes alone
+        dataset.precompute(strict=True, n_workers=1)
     return dataset
 
 
