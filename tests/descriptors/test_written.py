@@ -84,6 +84,7 @@ def test_a_descriptor_of_the_library_written_down_gives_the_same_numbers(
             "'os.system' is no module of igps",
         ),
         ("class_path: igps.nn.axes.Colour", "igps.nn.axes.Colour is no module of igps"),
+        ("class_path: igps.nn.colours.Colour", "No module named 'igps.nn.colours'"),
         (INTERIOR.replace("n_bins: 64", "bins: 64"), "unexpected keyword argument 'bins'"),
         (
             INTERIOR.replace("[potential,", "[colour,"),

@@ -13,6 +13,8 @@ from igps.nn.heads import ClassifierHead, Head
 from igps.nn.specification import IN_FOLDER, build_module, load_module
 
 _YAML = (".yaml", ".yml")
+# What a specification can raise that is none, or names what is not there
+_UNREADABLE = (ValueError, TypeError, AttributeError, LookupError, ImportError, RecursionError)
 
 
 def is_descriptor_file(path: str | Path) -> bool:
@@ -75,7 +77,7 @@ def _written_module(path: Path) -> nn.Module:
         raise FileNotFoundError(f"{path}: no such file. Check the path.")
     try:
         module = build_module(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError, LookupError, RecursionError, yaml.YAMLError) as error:
+    except (*_UNREADABLE, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path}: expected a descriptor ({reason}). Correct it.") from error
     return module.eval()
