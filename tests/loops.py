@@ -1,10 +1,11 @@
-"""Histograms by their definition: one pair of points, one dimension at a time."""
+"""Histograms by their definition, one pair of points at a time, and mean values, one point at a time."""
 
 import math
 from functools import reduce
 from itertools import combinations_with_replacement
 
 import numpy as np
+from numpy.linalg import det, norm
 
 
 def hat(value, centres):
@@ -90,3 +91,34 @@ def pair_histogram_by_loops(memberships, axes):
                     histogram[row] += weight * share
             n_pairs += 1
     return histogram / n_pairs
+
+
+def mean_values(vertices, faces, points, functions):
+    """(P, K) mean value interpolation of functions (V, K), point by point (Ju, Schaefer and Warren 2005)."""
+    values = np.empty((len(points), functions.shape[1]))
+    for i, point in enumerate(points):
+        offset = vertices - point
+        distance = norm(offset, axis=1)
+        u = (offset / distance[:, None])[faces]
+        sides = norm(
+            np.roll(u, -1, axis=1) - np.roll(u, -2, axis=1),
+            axis=2,
+        )
+        angles = 2 * np.arcsin(np.clip(sides / 2, 0, 1))
+        half = angles.sum(axis=1, keepdims=True) / 2
+        sines = np.sin(angles)
+        sine_after = np.roll(sines, -1, axis=1)
+        sine_before = np.roll(sines, -2, axis=1)
+        cosines = 2 * np.sin(half) * np.sin(half - angles) / (sine_after * sine_before) - 1
+        signed_sines = np.sign(det(u))[:, None] * np.sqrt(np.clip(1 - cosines**2, 0, None))
+        numerators = (
+            angles
+            - np.roll(cosines, -1, axis=1) * np.roll(angles, -2, axis=1)
+            - np.roll(cosines, -2, axis=1) * np.roll(angles, -1, axis=1)
+        )
+        weights = numerators / (distance[faces] * sine_after * np.roll(signed_sines, -2, axis=1))
+        # A face does not count for points in its plane outside the face.
+        weights[(np.abs(signed_sines) < 1e-7).any(axis=1)] = 0
+        total = np.bincount(faces.ravel(), weights.ravel(), len(vertices))
+        values[i] = total @ functions / total.sum()
+    return values

@@ -1,25 +1,25 @@
 """An independent reference for the numbers of a mesh: libigl's matrices, a dense eigensolver and NumPy loops."""
 
+import sys
 from dataclasses import replace
-from itertools import combinations_with_replacement
+from pathlib import Path
 
 import igl
 import numpy as np
 import scipy.linalg
 import scipy.sparse.linalg
-import torch
 import trimesh
-from numpy.linalg import det, norm
+from numpy.linalg import det
 from numpy.typing import NDArray
 
-from igps import PairHistogram, SpectralEmbedding, collate, compute_signature
-from igps.descriptors.literature.d2 import D2
-from igps.nn.axes import InteriorDistance, Potential
+from igps import compute_signature
+
+sys.path.append(str(Path(__file__).parents[1]))
+from loops import mean_values
 
 Floats = NDArray[np.float64]
 Surface = tuple[Floats, NDArray[np.int64]]
 
-N_CLASSES, N_BINS, REACH = 4, 16, 4.0
 # Smallest ratio of twice the area of a face to its longest side squared. The library mollifies thinner faces and libigl
 # does not; rounding errors of the cotangents of thin faces differ between formulas.
 _MIN_ASPECT = 1e-5
@@ -107,35 +107,11 @@ def confirm(mesh, signature, written, config, suffix):
         reference = np.square(extended) @ (1 / expected[:-1])
         error = np.abs(potential - reference).max() / np.abs(reference).max()
         check("extension", error < 1e-3, f"the potential of a sample is off by {error:.2g}")
-    batch = collate([signature])
-    histograms = _describe(signature)
-    for name, value in histograms.items():
-        check(
-            f"{name} sum",
-            bool(np.isfinite(value).all() and abs(value.sum() - 1) < 1e-5),
-            f"{value.sum()}",
-        )
-    batch_area = float(batch.area[0])
-    reference, doubtful = distances_histogram(
-        batch.surface.points[0].double().numpy() / np.sqrt(batch_area)
-    )
-    error = np.abs(histograms["d2"] - reference).sum() / 2
-    check("d2", error < 1e-5 + doubtful, f"{error:.2g} of the pairs are in other bins")
-    if len(signature.interior) > 1:
-        reference, doubtful = interior_histogram(
-            signature.interior.eigenfunctions / np.sqrt(values)
-        )
-        error = np.abs(histograms["interior"] - reference).sum() / 2
-        check(
-            "interior histogram",
-            error < 1e-4 + doubtful,
-            f"{error:.2g} of the pairs are in other cells",
-        )
-    _check_motion(mesh, signature, histograms, config, check)
+    _check_motion(mesh, signature, config, check)
     return doubts, checks
 
 
-def _check_motion(mesh, signature, histograms, config, check):
+def _check_motion(mesh, signature, config, check):
     """Check that a quarter turn, which maps the grid to itself, and a shift leave the numbers as they are."""
     turn = np.array(
         [
@@ -155,22 +131,6 @@ def _check_motion(mesh, signature, histograms, config, check):
     error = np.abs(moved.eigenvalues / signature.eigenvalues - 1).max()
     # The cotangents of thin faces are differences of squares, whose rounding errors change with a shift.
     check("eigenvalues moved", error < 1e-4, f"relative difference {error:.2g}")
-    for name, value in _describe(moved).items():
-        error = np.abs(value - histograms[name]).sum() / 2
-        check(f"{name} moved", error < 0.02, f"{error:.2g} of the pairs are in other cells")
-
-
-def _describe(signature):
-    batch = collate([signature])
-    histograms = {"d2": D2()(batch)[0].double().numpy()}
-    if len(signature.interior) > 1:
-        embedding = SpectralEmbedding(n_eigenpairs=len(signature.eigenvalues))
-        histogram = PairHistogram(
-            [Potential(N_CLASSES), InteriorDistance(N_BINS, REACH)], embedding
-        )
-        with torch.inference_mode():
-            histograms["interior"] = histogram(batch)[0].double().numpy()
-    return histograms
 
 
 def _centre(mesh):
@@ -266,37 +226,6 @@ def eigenpairs(vertices, faces, n_eigenpairs):
     return values, root @ vectors
 
 
-def mean_values(vertices, faces, points, functions):
-    """(P, K) mean value interpolation of functions (V, K), point by point (Ju, Schaefer and Warren 2005)."""
-    values = np.empty((len(points), functions.shape[1]))
-    for i, point in enumerate(points):
-        offset = vertices - point
-        distance = norm(offset, axis=1)
-        u = (offset / distance[:, None])[faces]
-        sides = norm(
-            np.roll(u, -1, axis=1) - np.roll(u, -2, axis=1),
-            axis=2,
-        )
-        angles = 2 * np.arcsin(np.clip(sides / 2, 0, 1))
-        half = angles.sum(axis=1, keepdims=True) / 2
-        sines = np.sin(angles)
-        sine_after = np.roll(sines, -1, axis=1)
-        sine_before = np.roll(sines, -2, axis=1)
-        cosines = 2 * np.sin(half) * np.sin(half - angles) / (sine_after * sine_before) - 1
-        signed_sines = np.sign(det(u))[:, None] * np.sqrt(np.clip(1 - cosines**2, 0, None))
-        numerators = (
-            angles
-            - np.roll(cosines, -1, axis=1) * np.roll(angles, -2, axis=1)
-            - np.roll(cosines, -2, axis=1) * np.roll(angles, -1, axis=1)
-        )
-        weights = numerators / (distance[faces] * sine_after * np.roll(signed_sines, -2, axis=1))
-        # A face does not count for points in its plane outside the face.
-        weights[(np.abs(signed_sines) < 1e-7).any(axis=1)] = 0
-        total = np.bincount(faces.ravel(), weights.ravel(), len(vertices))
-        values[i] = total @ functions / total.sum()
-    return values
-
-
 def _samples_confirmed(mesh, signature, vertices, faces, resolution):
     """Whether the samples are the cell centres of winding number above one half, except for centres on the surface."""
     low = vertices.min(axis=0)
@@ -327,35 +256,3 @@ def _samples_confirmed(mesh, signature, vertices, faces, resolution):
         not missing and not outside,
         f"{len(missing)} missing, {len(outside)} not inside, of {len(points)}",
     )
-
-
-def distances_histogram(points, n_bins=64, reach=2.0):
-    """D2 by a loop, and the share of distances so close to an edge of a bin that their bin depends on rounding."""
-    counts = np.zeros(n_bins)
-    doubtful = 0
-    for i in range(len(points)):
-        positions = norm(points[i + 1 :] - points[i], axis=1) * n_bins / reach
-        for position in positions:
-            counts[min(int(position), n_bins - 1)] += 1
-            doubtful += abs(position - round(position)) < 1e-3
-    return counts / counts.sum(), doubtful / counts.sum()
-
-
-def interior_histogram(embedding):
-    """The histogram of Rustamov 2010 by loops, and the share of pairs whose class depends on rounding."""
-    embedding = np.asarray(embedding, dtype=np.float64)
-    level = norm(embedding, axis=1) * N_CLASSES / 1.5
-    classes = np.minimum(level.astype(int), N_CLASSES - 1)
-    rows = {pair: i for i, pair in enumerate(combinations_with_replacement(range(N_CLASSES), 2))}
-    histogram = np.zeros((len(rows), N_BINS))
-    for i in range(len(embedding)):
-        distances = norm(embedding[i + 1 :] - embedding[i], axis=1)
-        positions = np.clip(distances * N_BINS / REACH - 0.5, 0, N_BINS - 1)
-        for j, position in enumerate(positions, start=i + 1):
-            row = rows[tuple(sorted((classes[i], classes[j])))]
-            lower = int(position)
-            histogram[row, lower] += 1 - (position - lower)
-            if position > lower:
-                histogram[row, lower + 1] += position - lower
-    near = np.abs(level - np.rint(level)) < 1e-5
-    return histogram / histogram.sum(), float(2 * near.mean())
