@@ -89,8 +89,7 @@ def test_the_installed_wheel_works(archives, tmp_path):
 
 def test_the_version_is_the_same_everywhere():
     citation = (PROJECT / "CITATION.cff").read_text()
-    found = re.search(r"^version: (.*)$", citation, flags=re.MULTILINE).group(1)
-    assert found == VERSION
+    assert re.search(r"^version: (.*)$", citation, flags=re.MULTILINE).group(1) == VERSION
     newest = re.search(r"^## (.*)$", (PROJECT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
     assert newest is not None
     assert newest.group(1) == VERSION

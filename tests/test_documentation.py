@@ -207,8 +207,7 @@ def check_retrieval(printed, folder):
         rankings.append([labels[j] for j in order if j != i])
     tier = np.mean([ranking[:3].count("biped") / 3 for ranking in rankings])
     first = np.mean([ranking[0] == "biped" for ranking in rankings])
-    expected = {"nn": round(100 * first), "ft": round(100 * tier)}
-    assert ast.literal_eval(printed) == expected
+    assert ast.literal_eval(printed) == {"nn": round(100 * first), "ft": round(100 * tier)}
 
 
 def check_classification(printed, folder):

@@ -48,15 +48,12 @@ def test_features_are_the_roots_of_the_histograms(paths, features, tmp_path):
     histograms = describe(dataset, interior(n_eigenpairs=20)).flatten(1).numpy()
     assert_allclose(features.fit_transform(paths), np.sqrt(histograms), atol=1e-6)
     plain = clone(features).set_params(square_root=False)
-    found = plain.transform([str(path) for path in paths])
-    assert_allclose(found, histograms, atol=1e-6)
+    assert_allclose(plain.transform([str(path) for path in paths]), histograms, atol=1e-6)
 
 
 def test_meshes_give_what_their_files_give(paths, features):
     meshes = [load_mesh(path) for path in paths[:2]]
-    found = features.transform(meshes)
-    expected = features.transform(paths[:2])
-    assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(features.transform(meshes), features.transform(paths[:2]), atol=1e-6)
 
 
 def test_rich_features_bring_their_attributes(paths, tmp_path):

@@ -342,9 +342,7 @@ def test_a_team_does_every_job_once_and_in_order(max_threads):
     with Team(max_threads) as team:
         for size in (0, 1, 3, 40, 2):
             done.clear()
-            found = team.each(square, range(size))
-            expected = [(number**2, 1) for number in range(size)]
-            assert found == expected
+            assert team.each(square, range(size)) == [(number**2, 1) for number in range(size)]
             assert sorted(done) == list(range(size))
 
 

@@ -89,8 +89,7 @@ def test_the_odd_pair_comes_first_and_cut_ones_are_not_judged():
     assert second.pair.structure == "kidney"
     assert second.size_score > 3.5 > second.form_score
     left, right = volumes[second.pair.left], volumes[second.pair.right]
-    expected = pytest.approx((left - right) / ((left + right) / 2))
-    assert second.size == expected
+    assert second.size == pytest.approx((left - right) / ((left + right) / 2))
     assert max(one.score for one in others) < 3.5
     assert last.pair.subject == "s6.nii"
     assert last.score is None

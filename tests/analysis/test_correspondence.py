@@ -37,13 +37,9 @@ def test_curvatures_and_thickness_of_a_spheroid():
     errors = measured[:, :2] / exact - 1
     assert np.sqrt(np.square(errors).mean(axis=0)).max() < 0.06
     assert np.abs(errors.mean(axis=0)).max() < 0.02
-    found = measured[:, :2].mean(axis=1)
-    expected = pytest.approx(exact.mean(axis=1), rel=0.1)
-    assert found == expected
+    assert measured[:, :2].mean(axis=1) == pytest.approx(exact.mean(axis=1), rel=0.1)
     # Normals of flat faces
-    found = np.exp(measured[:, 2]) * unit * of_circles
-    expected = pytest.approx(1, rel=0.25)
-    assert found == expected
+    assert np.exp(measured[:, 2]) * unit * of_circles == pytest.approx(1, rel=0.25)
 
 
 def test_a_rough_surface_is_no_thinner():

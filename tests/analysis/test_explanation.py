@@ -79,8 +79,7 @@ def test_all_shares_add_up_to_the_distance(name, batches):
     assert found.distance == pytest.approx(distance, rel=1e-3)  # there in single precision
     of_samples = sum(values.sum() for of_body in found.samples for values in of_body.values())
     assert of_samples == pytest.approx(found.distance, rel=1e-6)
-    expected = pytest.approx(found.distance, rel=1e-6)
-    assert sum(found.parts.values()) == expected
+    assert sum(found.parts.values()) == pytest.approx(found.distance, rel=1e-6)
     by_place = np.concatenate([np.concatenate([*one.values()]) for one in found.places])
     assert by_place.sum() == pytest.approx(found.distance, rel=1e-6)
     assert by_place.min() >= 0
@@ -115,8 +114,7 @@ def test_of_bodies_that_differ_in_size_alone_all_is_size(signatures):
     assert found.distance == pytest.approx(nearness * apart / 0.5, rel=1e-5)
     assert found.parts["size"] == pytest.approx(found.distance, rel=1e-5)
     for shares in (values for of_body in found.samples for values in of_body.values()):
-        expected = found.distance / 4 / len(shares)
-        np.testing.assert_allclose(shares, expected, rtol=1e-3)
+        np.testing.assert_allclose(shares, found.distance / 4 / len(shares), rtol=1e-3)
 
 
 def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(batches):
@@ -203,8 +201,7 @@ def test_shares_behind_a_head_are_those_of_small_steps(name, batches):
                 vectors = chosen.head(moved.square())
                 apart = chosen.distances(vectors[[0, 2]], vectors[[1, 3]]).diagonal()
             share += float(apart[0] - apart[1]) / 2e-4 / 100
-        expected = pytest.approx(share, rel=0.02, abs=1e-8)
-        assert float(shares[cell]) == expected
+        assert float(shares[cell]) == pytest.approx(share, rel=0.02, abs=1e-8)
 
 
 def test_the_share_of_a_sample_is_the_derivative_by_its_weight(batches):

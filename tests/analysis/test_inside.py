@@ -156,8 +156,7 @@ def test_variogram_and_moran_are_counted_by_a_loop(made):
     }
     for name, (start, end) in bounds.items():
         half = np.mean([(ct[i] - ct[j]) ** 2 / 2 for _, i, j in pairs[start:end]])
-        expected = pytest.approx(half / ct.var(), rel=1e-3)
-        assert numbers[f"ct.variogram.{name}"] == expected
+        assert numbers[f"ct.variogram.{name}"] == pytest.approx(half / ct.var(), rel=1e-3)
     centred = ct - ct.mean()
     neighbours = {i: [] for i in range(P)}
     for _, i, j in pairs[:n_near]:
@@ -200,12 +199,8 @@ def test_a_constant_has_no_numbers_that_compare_its_values(made):
 
 
 def test_equal_values_share_the_brightest_tenth():
-    found = brightest(np.arange(20.0))
-    expected = [0] * 18 + [1, 1]
-    assert_allclose(found, expected)
-    found = brightest(np.array([1.0] * 5 + [0] * 15))
-    expected = [0.4] * 5 + [0] * 15
-    assert_allclose(found, expected)
+    assert_allclose(brightest(np.arange(20.0)), [0] * 18 + [1, 1])
+    assert_allclose(brightest(np.array([1.0] * 5 + [0] * 15)), [0.4] * 5 + [0] * 15)
     assert_allclose(
         brightest(np.array([2.0] + [1] * 4 + [0] * 15))[:5],
         [1] + [0.25] * 4,

@@ -25,8 +25,7 @@ def test_a_larger_ball_lies_outside_by_the_difference_of_the_radii():
     assert_allclose(offsets(ball(1.2, "cm"), reference), found, atol=1e-6)
     at_equal_volume = offsets(ball(12.0, "mm"), reference, keep_size=False)
     assert_allclose(at_equal_volume, 0.0, atol=0.08)
-    expected = 2 / (10 * np.sqrt(4 * np.pi))
-    assert misfit(found[None], reference) == pytest.approx(expected, rel=0.03)
+    assert misfit(found[None], reference) == pytest.approx(2 / (10 * np.sqrt(4 * np.pi)), rel=0.03)
 
 
 def test_a_bump_is_found_at_its_place_on_a_turned_body():
@@ -44,8 +43,7 @@ def test_a_bump_is_found_at_its_place_on_a_turned_body():
     )
     found = offsets(other, reference)
     assert np.linalg.norm(body.vertices[found.argmax()] - body.vertices[weight.argmax()]) < 6
-    expected = pytest.approx(3 * weight.max(), rel=0.25)
-    assert found.max() == expected
+    assert found.max() == pytest.approx(3 * weight.max(), rel=0.25)
     assert np.abs(found[weight < 0.01]).max() < 0.5
 
 

@@ -41,8 +41,7 @@ def test_points_of_a_plane_keep_all_their_distances(n):
     assert found.points[:, 0].var() > found.points[:, 1].var()
     order = default_rng(1).permutation(n)
     shuffled = body_map(distances[np.ix_(order, order)])
-    expected = found.points[order]
-    np.testing.assert_allclose(shuffled.points, expected, atol=1e-5)
+    np.testing.assert_allclose(shuffled.points, found.points[order], atol=1e-5)
 
 
 def test_the_improved_map_has_less_stress_than_the_classical_one():
@@ -126,8 +125,7 @@ def test_clusters_that_were_put_in_are_found_and_stable(linkage):
     )
     found = clusters_of(cdist(points, points), linkage=linkage)
     assert found.labels[:20].tolist() == [0] * 20
-    expected = [1] * 12 + [2] * 12
-    assert sorted(found.labels[20:].tolist()) == expected
+    assert sorted(found.labels[20:].tolist()) == [1] * 12 + [2] * 12
     assert np.ptp(found.labels[20:32]) == np.ptp(found.labels[32:]) == 0
     assert min(found.stability) > 0.99
     for number, middle in enumerate(found.medoids):
@@ -141,8 +139,7 @@ def test_clusters_that_were_put_in_are_found_and_stable(linkage):
 def test_bodies_that_are_alike_are_one_cluster():
     for apart in (0.0, 1.0):  # all of them, or each from each other by the same
         for n in (3, 4, 6):
-            found = clusters_of(apart * (np.ones((n, n)) - np.eye(n))).labels.tolist()
-            assert found == [0] * n
+            assert clusters_of(apart * (np.ones((n, n)) - np.eye(n))).labels.tolist() == [0] * n
 
 
 def test_clusters_of_one_cloud_are_told_unstable():
@@ -198,8 +195,7 @@ def test_stability_is_the_mean_largest_jaccard_index_of_halves():
             left = own & set(drawn.tolist())
             if len(left) > 1:
                 of.append(max(len(left & one) / len(left | one) for one in again))
-    expected = pytest.approx([np.mean(of) for of in shares])
-    assert found.stability == expected
+    assert found.stability == pytest.approx([np.mean(of) for of in shares])
 
 
 def test_too_few_bodies_have_no_stability():

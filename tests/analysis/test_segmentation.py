@@ -32,8 +32,7 @@ def test_a_ball_has_nothing_apart_no_hole_and_hardly_a_gap():
 def test_what_lies_apart_is_counted_whichever_comes_first():
     large = ball(12, 28)
     small = np.roll(ball(6, 28), -20, axis=0)
-    expected = pytest.approx(1 / 9, rel=0.05)
-    assert stray_root(large | small) ** 2 == expected
+    assert stray_root(large | small) ** 2 == pytest.approx(1 / 9, rel=0.05)
 
 
 def test_a_cavity_is_the_ball_that_is_missing():
@@ -86,8 +85,7 @@ def test_a_gap_does_not_depend_on_the_grid_and_not_on_the_unit():
         np.repeat(mask, 2, axis=2),
         ONES * [1, 1, 0.5],
     )
-    expected = pytest.approx(usual, rel=0.1)
-    assert found == expected
+    assert found == pytest.approx(usual, rel=0.1)
     coarser = gap_root(drilled(60, 15, 64), ONES)
     assert coarser == pytest.approx(usual, rel=0.1)
 

@@ -19,8 +19,7 @@ def test_the_largest_rigid_part_is_superposed():
     others[away] = turn.inv().apply(moved - [5.0, -2.0, 1.0])
     found = superposition(points, others)
     assert_allclose(found.rotation, turn.as_matrix(), atol=1e-5)
-    expected = [5.0, -2.0, 1.0]
-    assert_allclose(found.shift, expected, atol=1e-5)
+    assert_allclose(found.shift, [5.0, -2.0, 1.0], atol=1e-5)
     steps = np.linalg.norm(moved - points[away], axis=1)
     assert_allclose(found.distances[away], steps, atol=1e-4)
     assert found.distances[~away].max() < 1e-4
@@ -37,5 +36,4 @@ def test_equal_errors_of_all_points_are_those_of_least_squares():
     )
     angle = (Rotation.from_matrix(found.rotation) * turn.inv()).magnitude()
     assert angle < 0.005
-    expected = pytest.approx(0.01 * np.sqrt(2.37), rel=0.2)
-    assert np.median(found.distances) == expected
+    assert np.median(found.distances) == pytest.approx(0.01 * np.sqrt(2.37), rel=0.2)

@@ -281,8 +281,7 @@ def test_explain_writes_shares_that_add_up(is_group, root, tmp_path, capsys):
     printed = capsys.readouterr().out
     (part,) = table(tmp_path / "explain.csv")
     shares = [float(row["share"]) for row in table(tmp_path / "explain_samples.csv")]
-    expected = pytest.approx(float(part["share"]), rel=1e-6)
-    assert sum(shares) == expected
+    assert sum(shares) == pytest.approx(float(part["share"]), rel=1e-6)
     if is_group:
         assert "of the surface differs significantly" in printed
     else:
@@ -311,8 +310,7 @@ def test_explain_paints_the_voxels_in_which_an_attribute_differs(tmp_path, capsy
     told = json.loads(capsys.readouterr().out)
     rows = table(tmp_path / "out" / "explain_ct.csv")
     shares = np.array([float(row["share"]) for row in rows])
-    expected = pytest.approx(told["attributes"]["ct"], rel=1e-6)
-    assert shares.sum() == expected
+    assert shares.sum() == pytest.approx(told["attributes"]["ct"], rel=1e-6)
     found = nibabel.load(tmp_path / "out" / "explain_bright.nii.gz_bright_ct.nii.gz")
     density = found.get_fdata()
     np.testing.assert_allclose(found.affine, affine)
@@ -401,8 +399,7 @@ def test_explain_heeds_size_and_side(is_group, root, capsys):
     shares = {row["histogram"]: row["share"] for row in found["shares"]}
     assert list(shares)[-2:] == ["side", "size"]
     assert shares["size"] > 0.5 * found["distance"]
-    expected = pytest.approx(found["distance"], rel=1e-3)
-    assert shares["size"] + shares["side"] == expected
+    assert shares["size"] + shares["side"] == pytest.approx(found["distance"], rel=1e-3)
     if is_group:  # painted is the middle of each, although some of its numbers are negative
         assert {name[-5] for name in found["bodies"]} <= set("1234")
 

@@ -104,10 +104,8 @@ def test_retrieve_prints_and_writes_what_python_computes(root, tmp_path, capsys)
     for i, name in enumerate(dataset.bodies.names):
         ranked = [row for row in rows if row["query"] == name]
         others = [j for j in torch.argsort(distances[i], stable=True).tolist() if j != i]
-        found = [row["model"] for row in ranked]
-        assert found == [dataset.bodies.names[j] for j in others]
-        found = [row["relevant"] for row in ranked]
-        assert found == [str(int(i // 3 == j // 3)) for j in others]
+        assert [row["model"] for row in ranked] == [dataset.bodies.names[j] for j in others]
+        assert [row["relevant"] for row in ranked] == [str(int(i // 3 == j // 3)) for j in others]
     assert not (out / "failures.csv").exists()
 
 
@@ -319,11 +317,9 @@ def test_extract_files_and_folder(root, tmp_path):
     with np.load(tmp_path / "two.npz") as two, np.load(tmp_path / "deep" / "all.npz") as everything:
         assert two["names"].tolist() == [str(f) for f in files]
         assert two["features"].shape == (2, 10, 64)
-        found = two["features"].sum(axis=(1, 2))
-        assert_allclose(found, 1, atol=1e-5)
+        assert_allclose(two["features"].sum(axis=(1, 2)), 1, atol=1e-5)
         assert everything["labels"].tolist() == ["ball"] * 3 + ["egg"] * 3
-        expected = everything["features"][[4, 0]]
-        assert_allclose(two["features"], expected, atol=1e-7)
+        assert_allclose(two["features"], everything["features"][[4, 0]], atol=1e-7)
 
 
 def test_extract_short_vectors(root, tmp_path, capsys):
@@ -333,8 +329,7 @@ def test_extract_short_vectors(root, tmp_path, capsys):
     run(*common, "--short", "--out", tmp_path / "short.npz")
     with np.load(tmp_path / "long.npz") as long, np.load(tmp_path / "short.npz") as short:
         assert long["features"].shape[1] > 256 >= short["features"].shape[1]
-        found = np.linalg.norm(short["features"], axis=1)
-        assert_allclose(found, 1, atol=1e-5)
+        assert_allclose(np.linalg.norm(short["features"], axis=1), 1, atol=1e-5)
         module = descriptor("pretrained")
         assert isinstance(module, EmbeddedDescriptor)
         expected = module.shorten(torch.from_numpy(long["features"])).numpy()
@@ -376,9 +371,7 @@ def test_query_lists_the_nearest(root, tmp_path, capsys):
     distances = chi_square(histograms[4:5], histograms)[0]
     names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(3)]
     nearest = torch.argsort(distances, stable=True)[:4].tolist()
-    found = [line.split()[2] for line in lines]
-    expected = [names[i] for i in nearest]
-    assert found == expected
+    assert [line.split()[2] for line in lines] == [names[i] for i in nearest]
     assert [float(line.split()[1]) for line in lines] == pytest.approx(
         distances[nearest].tolist(), rel=5e-3
     )
@@ -547,10 +540,8 @@ def test_json_is_what_the_table_tells(root, tmp_path, capsys):
     histograms = describe(dataset, small_interior())
     distances = chi_square(histograms[1:2], histograms)[0]
     order = distances.argsort()[:3]
-    found = [row["name"] for row in rows]
-    assert found == [dataset.bodies.names[i] for i in order]
-    found = [row["distance"] for row in rows]
-    assert found == pytest.approx(distances[order].tolist(), abs=1e-6)
+    assert [row["name"] for row in rows] == [dataset.bodies.names[i] for i in order]
+    assert [row["distance"] for row in rows] == pytest.approx(distances[order].tolist(), abs=1e-6)
     assert rows[0]["rank"] == 1
     assert rows[0]["class"] == "ball"
     words = [

@@ -50,8 +50,7 @@ def test_command_prints_and_writes_what_python_computes(root, tmp_path, capsys):
         expected.pop("seconds_per_mesh")
         assert row == expected
         (line,) = [line for line in printed if line.startswith(name)]
-        found = line.split()[1:9]
-        assert found == [f"{100 * expected[key]:.1f}" for key in KEYS[1:9]]
+        assert line.split()[1:9] == [f"{100 * expected[key]:.1f}" for key in KEYS[1:9]]
         assert line.split()[9] == "6"
         with np.load(out / "distances" / f"{name}.npz") as archive:
             np.testing.assert_array_equal(archive["distances"], result.distances)
@@ -96,9 +95,7 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(root, tmp_path, 
         run(*arguments, *chosen)
         rows = list(csv.reader((tmp_path / "failures.csv").open(newline="")))
         assert rows[0] == ["descriptor", "name", "error"]
-        found = [row[:2] for row in rows[1:]]
-        expected = [["all", "egg/bad.off"], ["picky", "egg/1.off"]]
-        assert found == expected
+        assert [row[:2] for row in rows[1:]] == [["all", "egg/bad.off"], ["picky", "egg/1.off"]]
         assert "a single triangle" in rows[1][2]
         assert "too much" in rows[2][2]
         printed = capsys.readouterr().out

@@ -30,12 +30,9 @@ def test_table_and_file_of_a_folder_that_can_be_used(tmp_path, capsys):
     assert header.split() == ["vertices", "after", "seconds", "MB", "unit", "remarks"]
     cells = {line.split()[0]: line.split()[1:] for line in lines}
     size = str(N_VERTICES)
-    found = cells["a/clean.off"][:2] + cells["a/clean.off"][4:]
-    assert found == [size, size, "none", "none"]
+    assert cells["a/clean.off"][:2] + cells["a/clean.off"][4:] == [size, size, "none", "none"]
     soup = cells["a/soup.off"]
-    found = soup[:2] + soup[4:]
-    expected = [str(3 * N_FACES), size, "none", "welded"]
-    assert found == expected
+    assert soup[:2] + soup[4:] == [str(3 * N_FACES), size, "none", "welded"]
     assert cells["b/box.off"][0] == "8"
     assert cells["b/box.off"][4:] == ["none", "subdivided"]
     assert total.startswith("3 bodies: 2 repaired, 0 cannot be used; about ")

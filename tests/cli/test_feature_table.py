@@ -87,8 +87,7 @@ def test_a_wide_table_has_a_row_for_each_file(root, tmp_path, suffix):
     wide = read(tmp_path / f"wide.{suffix}")
     first = ["file", "class", "age", "unit", "liver.at_border", "liver.border_sides", "liver.notes"]
     assert wide.columns.tolist()[:7] == first
-    expected = 4 + 2 * (3 + len(POWERS) + 642)
-    assert len(wide.columns) == expected
+    assert len(wide.columns) == 4 + 2 * (3 + len(POWERS) + 642)
     assert wide["class"].tolist() == ["well", "ill"]
     assert wide["age"].sum() == 40  # a number in Parquet, too
     for part in ("liver", "spleen"):
@@ -120,10 +119,8 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path, capsys):
     extract(tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     assert wide["folder"].tolist() == [f"s{i}/segmentations" for i in range(3)]
-    expected = [512, 729, 1000]
-    assert_allclose(wide["cube.volume_mm3"], expected, rtol=1e-3)
-    expected = [375, 425, np.nan]
-    assert_allclose(wide["bar.volume_mm3"], expected, rtol=1e-3)
+    assert_allclose(wide["cube.volume_mm3"], [512, 729, 1000], rtol=1e-3)
+    assert_allclose(wide["bar.volume_mm3"], [375, 425, np.nan], rtol=1e-3)
     assert wide["folder of labels.csv"].tolist() == [
         "a",
         "a",
@@ -135,9 +132,7 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path, capsys):
     # Of a single subject
     extract(tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide")
     one = pd.read_csv(tmp_path / "one.csv")
-    found = one[["bar.volume_mm3", "cube.volume_mm3"]]
-    expected = [[375, 512]]
-    assert_allclose(found, expected, rtol=1e-3)
+    assert_allclose(one[["bar.volume_mm3", "cube.volume_mm3"]], [[375, 512]], rtol=1e-3)
 
 
 def test_masks_that_are_numbered_have_a_row_each(tmp_path):
@@ -151,8 +146,7 @@ def test_masks_that_are_numbered_have_a_row_each(tmp_path):
     extract(tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     border = ["at_border", "border_sides"]
-    found = wide.columns.tolist()[:6]
-    assert found == ["file", "class", "unit", *border, "notes"]
+    assert wide.columns.tolist()[:6] == ["file", "class", "unit", *border, "notes"]
     assert wide["file"].tolist() == [f"{label}/{number}.nii.gz" for label, number in sides]
     assert_allclose(wide["volume_mm3"], [49 * side for side in sides.values()], rtol=1e-3)
 
@@ -182,8 +176,7 @@ def test_a_body_that_a_file_lacks_has_no_values(root, tmp_path):
     extract(tmp_path, tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
     assert wide["liver.class"].tolist() == ["a", "b"]
-    found = wide.loc[:, "spleen.class":].isna().all(axis=1).tolist()
-    assert found == [True, False]
+    assert wide.loc[:, "spleen.class":].isna().all(axis=1).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(

@@ -131,8 +131,7 @@ def test_groups_tests_where_the_signal_lies_beside_shape(tmp_path, capsys):
     printed = capsys.readouterr().out
     with (tmp_path / "out" / "groups.csv").open(newline="") as file:
         rows = {row["body"]: row for row in csv.DictReader(file)}
-    expected = {"all", "all, inside", *(f"all, {name}" for name in column_names(["ct"]))}
-    assert set(rows) == expected
+    assert set(rows) == {"all", "all, inside", *(f"all, {name}" for name in column_names(["ct"]))}
     assert float(rows["all"]["permanova_p"]) > 0.05
     assert float(rows["all, inside"]["permanova_p"]) <= 0.01
     assert float(rows["all, ct.rim.contrast"]["permanova_q"]) <= 0.01

@@ -37,6 +37,7 @@ AFFINE = np.eye(4)
 AFFINE[:3, :3] = TURN * [0.31, 0.23, 0.4]
 AFFINE[:3, 3] = TURN @ [-3.1, -3.0, -3.3]
 SHAPE = (22, 27, 17)
+PLACES = np.moveaxis(np.indices(SHAPE), 0, -1)  # of voxels
 INSIDE = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
 
 
@@ -46,11 +47,7 @@ def linear(points):
 
 def image():
     """The linear function at the centres of all voxels."""
-    index = np.stack(
-        np.meshgrid(*map(np.arange, SHAPE), indexing="ij"),
-        axis=-1,
-    )
-    return linear(index @ AFFINE[:3, :3].T + AFFINE[:3, 3])
+    return linear(PLACES @ AFFINE[:3, :3].T + AFFINE[:3, 3])
 
 
 def write_nifti(path, values):
@@ -90,27 +87,18 @@ def test_an_image_gives_a_linear_function_wherever_it_lies(body, suffix, write):
 @pytest.mark.parametrize("suffix", [".dx", ".mrc"])
 def test_a_grid_gives_a_linear_function(body, suffix):
     grids = pytest.importorskip("gridData")
-    index = np.stack(
-        np.meshgrid(*map(np.arange, SHAPE), indexing="ij"),
-        axis=-1,
-    )
     delta = np.array([0.5, 0.25, 0.5])
     origin = np.array([-5.0, -3.0, -4.0])
-    grid = grids.Grid(linear(index * delta + origin), origin=origin, delta=delta)
+    grid = grids.Grid(linear(PLACES * delta + origin), origin=origin, delta=delta)
     grid.export(str(body.path.with_name(f"a{suffix}")))
-    found = attribute_source(f"a{suffix}")(body, INSIDE)
-    assert_allclose(found, linear(INSIDE), atol=1e-4)
+    assert_allclose(attribute_source(f"a{suffix}")(body, INSIDE), linear(INSIDE), atol=1e-4)
 
 
 def test_axes_of_a_map_in_another_order_are_put_right(body):
     mrcfile = pytest.importorskip("mrcfile")
-    index = np.stack(
-        np.meshgrid(*map(np.arange, SHAPE), indexing="ij"),
-        axis=-1,
-    )
     delta = np.array([0.5, 0.25, 0.5])
     start = np.array([-10, -12, -8])
-    values = linear((index + start) * delta).astype(np.float32)
+    values = linear((PLACES + start) * delta).astype(np.float32)
     with mrcfile.new(body.path.with_name("a.map")) as file:
         # Columns along z, rows along x, sections along y
         file.set_data(np.ascontiguousarray(values.transpose(1, 0, 2)))
@@ -126,13 +114,9 @@ def test_axes_of_a_map_in_another_order_are_put_right(body):
 def test_a_map_is_placed_by_its_origin_or_else_by_its_start(told, body):
     """If both are given, only the origin counts, as in Chimera, EMAN and IMP. The oracle is a linear function."""
     mrcfile = pytest.importorskip("mrcfile")
-    index = np.stack(
-        np.meshgrid(*map(np.arange, SHAPE), indexing="ij"),
-        axis=-1,
-    )
     start = np.array([-10, -12, -8])
     with mrcfile.new(body.path.with_name("a.mrc")) as file:
-        file.set_data(np.ascontiguousarray(linear((index + start) * 0.5).astype(np.float32).T))
+        file.set_data(np.ascontiguousarray(linear((PLACES + start) * 0.5).astype(np.float32).T))
         file.voxel_size = 0.5
         if told != "start":
             file.header.origin = tuple(0.5 * start)
@@ -373,8 +357,7 @@ def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog):
             found = fill_missing(given, points, "here")
         assert found[39] == 38
         assert found[10] in (9, 11)
-        expected = np.delete(values, [10, 39])
-        np.testing.assert_array_equal(np.delete(found, [10, 39]), expected)
+        np.testing.assert_array_equal(np.delete(found, [10, 39]), np.delete(values, [10, 39]))
         assert "here: 2 of 40 values were taken from the nearest point" in caplog.text
         given[:5] = fill
         with pytest.raises(

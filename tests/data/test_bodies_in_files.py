@@ -243,8 +243,7 @@ def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path):
         assert names == {"dot.mhd", "deep.gltf", "list.gltf", "out.gltf"}
         for failure in failures:
             assert "not readable as" in failure.error
-        found = dataset.usable(failures)[0].signature.volume
-        assert found == pytest.approx(ball.volume)
+        assert dataset.usable(failures)[0].signature.volume == pytest.approx(ball.volume)
 
 
 def test_what_is_read_beside_a_file_counts(tmp_path, trust_recent_files):
@@ -360,9 +359,7 @@ def test_a_single_label_among_subjects_with_several_is_named_like_theirs(tmp_pat
     bodies = find_bodies(tmp_path, classes="body")
     assert bodies.names == ("a.nii.gz#1", "a.nii.gz#2", "b.nii.gz#1", "b.nii.gz#2", "c.nii.gz#1")
     assert bodies.labels == ("1", "2", "1", "2", "1")
-    found = load_mesh(tmp_path / "c.nii.gz", part="1").volume
-    expected = pytest.approx(64, rel=0.01)
-    assert found == expected
+    assert load_mesh(tmp_path / "c.nii.gz", part="1").volume == pytest.approx(64, rel=0.01)
 
 
 def test_masks_of_organs_are_named_after_their_files(tmp_path):

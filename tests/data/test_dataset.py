@@ -92,8 +92,7 @@ def test_functions_of_position_become_attributes(root, tmp_path):
         for samples in (part[1].signature.interior, part[1].signature.surface):
             height = samples.attributes["height"]
             assert_allclose(height, samples.points[:, 2], rtol=1e-6)
-    found = SignatureDataset(root, CONFIG, tmp_path / "cache")[0].signature.interior.attributes
-    assert found == {}
+    assert SignatureDataset(root, CONFIG, tmp_path / "cache")[0].signature.interior.attributes == {}
     wrong = {"height": lambda body, points: points[:-1]}
     broken = SignatureDataset(root, CONFIG, tmp_path / "cache", attributes=wrong)
     with pytest.raises(

@@ -80,9 +80,7 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
     shutil.copy(path, renamed)
     write_body(other, 1.1, 1.6)
     assert pipeline.key(BodyRef(copy)) == pipeline.key(BodyRef(path))
-    found = replace(pipeline, cache_dir=tmp_path).key(BodyRef(path))
-    expected = pipeline.key(BodyRef(path))
-    assert found == expected
+    assert replace(pipeline, cache_dir=tmp_path).key(BodyRef(path)) == pipeline.key(BodyRef(path))
     pipelines = [pipeline, replace(pipeline, config=replace(CONFIG, seed=1))]
     for given in ({"mend": "never"}, {"mend": "always"}, {"allow_open": True}):
         pipelines.append(replace(pipeline, reading=LoadOptions(**given)))

@@ -35,9 +35,7 @@ def test_unseen_split_shares_no_class():
 
 def test_a_whole_number_may_be_a_float():
     labels = torch.arange(3).repeat_interleave(4)
-    found = split_seen(labels, 3.0, n_validation=1.0)
-    expected = split_seen(labels, 3, n_validation=1)
-    assert found == expected
+    assert split_seen(labels, 3.0, n_validation=1.0) == split_seen(labels, 3, n_validation=1)
 
 
 def test_shares_leave_two_of_each_class_to_validate_and_to_test():
@@ -58,8 +56,7 @@ def test_more_training_classes_are_added_to_fewer():
 
 def test_validation_is_taken_from_the_training_part_alone():
     for split in (split_seen, split_unseen):
-        found = split(LABELS, 4, seed=2).test
-        assert found == split(LABELS, 4, n_validation=2, seed=2).test
+        assert split(LABELS, 4, seed=2).test == split(LABELS, 4, n_validation=2, seed=2).test
 
 
 def test_splits_depend_on_the_seed_alone():

@@ -55,8 +55,7 @@ def test_scaled_bodies_differ_by_their_size_alone():
     without_unit = ("extent", "convexity", "n_pieces", "euler_number")
     has_unit = torch.tensor([name not in without_unit for name in sized.columns])
     doubled = (logarithms[1] - logarithms[0])[has_unit]
-    expected = torch.full_like(doubled, math.log(2))
-    torch.testing.assert_close(doubled, expected, atol=1e-3, rtol=0)
+    torch.testing.assert_close(doubled, torch.full_like(doubled, math.log(2)), atol=1e-3, rtol=0)
     torch.testing.assert_close(
         logarithms[3],
         logarithms[0],

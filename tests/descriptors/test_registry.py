@@ -95,9 +95,7 @@ def test_own_class_function_and_object_by_import_path(own, blob):
         assert isinstance(one, igps.Descriptor)
         assert not one.training
     assert made["Roundness"].name == "roundness"
-    found = made["Roundness"](batch).item()
-    expected = pytest.approx(blob.volume / blob.area**1.5)
-    assert found == expected
+    assert made["Roundness"](batch).item() == pytest.approx(blob.volume / blob.area**1.5)
     torch.testing.assert_close(made["coarse"](batch), changed(D2(), n_bins=8)(batch))
     torch.testing.assert_close(made["ready"](batch), changed(D2(), n_bins=16)(batch))
     assert igps.descriptor(f"{own}:ready") is made["ready"]

@@ -184,8 +184,7 @@ def test_a_signed_volume_is_that_of_its_three_vectors():
     three = np.stack([by_distance, of_surface, by_heat])
     expected = det(three) / norm(three, axis=1).prod() ** (2 / 3)
     assert abs(expected) > 1e-4
-    found = float(signed_volumes(collate([signature]))[0, 0])
-    assert found == pytest.approx(expected, rel=1e-3)
+    assert float(signed_volumes(collate([signature]))[0, 0]) == pytest.approx(expected, rel=1e-3)
 
 
 def test_names_carry_the_choice():
@@ -359,8 +358,7 @@ def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_
     assert again.name == loaded.name
     described = loaded(batch)
     assert_close(described, model(batch))
-    expected = model.distances(described, described)
-    assert_close(loaded.distances(described, described), expected)
+    assert_close(loaded.distances(described, described), model.distances(described, described))
 
 
 @pytest.mark.parametrize(

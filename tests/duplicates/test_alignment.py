@@ -184,8 +184,7 @@ def test_in_place_nothing_is_moved():
     )
     shifted = TriangleSurface(vertices + step, faces)
     beside = SurfaceSamples(ball.points + step, ball.normals, lambda: shifted)
-    expected = pytest.approx(0.02 / np.sqrt(3), rel=0.03)
-    assert offset_in_place(ball, shifted) == expected
+    assert offset_in_place(ball, shifted) == pytest.approx(0.02 / np.sqrt(3), rel=0.03)
     assert surface_distance(ball, beside) < 1e-4
 
 
@@ -198,8 +197,7 @@ def test_distances_beyond_an_edge_are_those_to_the_edge():
         points,
         np.tile([0.0, 0.6, 0.8], (30, 1)),
     )
-    found = offset_in_place(beyond, TriangleSurface(box.vertices, box.faces))
-    assert found == pytest.approx(0.05)
+    assert offset_in_place(beyond, TriangleSurface(box.vertices, box.faces)) == pytest.approx(0.05)
 
 
 def test_thin_sheets_of_other_widths_are_told_apart():

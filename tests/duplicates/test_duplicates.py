@@ -106,8 +106,7 @@ def test_copies_are_grouped_and_neither_poses_nor_siblings(dataset, root):
     assert grouped(found.groups) == SAME
     assert found.n_files == 7
     assert found.failures == ()
-    expected = {name: root / name for group in found.groups for name in group}
-    assert found.paths == expected
+    assert found.paths == {name: root / name for group in found.groups for name in group}
     # As many pairs as join the groups, and each of one group.
     assert len(found.copies) == 3
     for copy in found.copies:
@@ -207,8 +206,7 @@ def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path):
     for name, body in (("one", fine), ("copy", copied(fine, 3, 2.0)), ("longer", longer)):
         body.export(tmp_path / f"{name}.off")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
-    found = grouped(duplicates(dataset, n_workers=1).groups)
-    assert found == {frozenset({"one.off", "copy.off"})}
+    assert grouped(duplicates(dataset, n_workers=1).groups) == {frozenset({"one.off", "copy.off"})}
 
 
 def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path):
@@ -251,16 +249,14 @@ def test_each_file_of_a_group_has_one_finer_file_beside_it():
         calibration,
     )
     # 3 is as fine as 0 and leads; 2 is the same as 3, which leads, and as 1, which does not.
-    expected = {(0, 1): 0.1, (3, 2): 0.3, (3, 4): 0.1}
-    assert found == expected
+    assert found == {(0, 1): 0.1, (3, 2): 0.3, (3, 4): 0.1}
     del apart[2, 3]
     found = assigned(
         [0, 1, 2, 3, 4],
         Table(),
         calibration,
     )
-    expected = {(0, 1): 0.1, (1, 2): 0.05, (3, 4): 0.1}
-    assert found == expected
+    assert found == {(0, 1): 0.1, (1, 2): 0.05, (3, 4): 0.1}
 
 
 def test_handles_tell_bodies_apart_however_near_they_are(tmp_path):

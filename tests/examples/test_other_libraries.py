@@ -156,8 +156,7 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
 
     theirs = LpDistance(normalize_embeddings=False)  # and back: any of theirs is a distance here
     scores = igps.retrieval_scores(theirs(cells, cells), dataset.labels).mean()
-    expected = igps.retrieval_scores(torch.cdist(cells, cells), dataset.labels).mean()
-    assert scores == expected
+    assert scores == igps.retrieval_scores(torch.cdist(cells, cells), dataset.labels).mean()
 
 
 def test_missing_extras_are_named(monkeypatch, dataset):

@@ -64,12 +64,9 @@ def test_it_ranks_as_the_descriptor_does(dataset, root, tmp_path):
     distances = chi_square(histograms[4:5], histograms)[0]
     found = gallery.query(root / "egg" / "1.off", top=4, cache_dir=tmp_path / "cache")
     nearest = torch.argsort(distances, stable=True)[:4].tolist()
-    expected = [dataset.bodies.names[i] for i in nearest]
-    assert [match.name for match in found] == expected
-    expected = [(dataset.bodies.labels or ())[i] for i in nearest]
-    assert [match.label for match in found] == expected
-    expected = [dataset.bodies.paths[i].resolve() for i in nearest]
-    assert [match.path for match in found] == expected
+    assert [match.name for match in found] == [dataset.bodies.names[i] for i in nearest]
+    assert [match.label for match in found] == [(dataset.bodies.labels or ())[i] for i in nearest]
+    assert [match.path for match in found] == [dataset.bodies.paths[i].resolve() for i in nearest]
     np.testing.assert_allclose(
         [match.distance for match in found], distances[nearest], rtol=2e-3, atol=1e-6
     )
@@ -280,8 +277,7 @@ def test_sync_finds_what_is_new_changed_and_gone(root, tmp_path, monkeypatch, re
         table += f"{name},round\n"
     (root / "labels.csv").write_text(table)
     dataset = now()
-    found = sync(gallery, dataset, root, n_workers=1)
-    assert found == (0, 0, [])
+    assert sync(gallery, dataset, root, n_workers=1) == (0, 0, [])
     assert gallery.remove("name = 'o''clock.off'") == 1
     built, _ = Gallery.build(
         tmp_path / "built.igps",
@@ -291,8 +287,7 @@ def test_sync_finds_what_is_new_changed_and_gone(root, tmp_path, monkeypatch, re
     )
     described = describe(dataset, small_interior())
     assert gallery.nearest(described) == built.nearest(described)
-    found = {one.label for one in built.nearest(described)[0]}
-    assert found == {"round"}
+    assert {one.label for one in built.nearest(described)[0]} == {"round"}
 
 
 def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(root, tmp_path, monkeypatch, caplog):
@@ -322,8 +317,7 @@ def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(root, tmp_path, m
         seen = SignatureDataset(root, CONFIG, cache)
     assert "egg: this folder is left out" in caplog.text
     assert len(seen) == len(dataset) - 4
-    found = sync(gallery, seen, root, n_workers=1)
-    assert found == (0, 1, [])
+    assert sync(gallery, seen, root, n_workers=1) == (0, 1, [])
     assert names_in(gallery) == sorted({*dataset.bodies.names} - {"ball/0.off"})
 
 
@@ -382,11 +376,9 @@ def test_sync_notices_a_table_of_names_that_was_edited(tmp_path, trust_recent_fi
         n_workers=1,
     )
     before = {row["part"]: row["volume"] for row in gallery.rows("part", "volume")}
-    found = sync(gallery, now(), tmp_path / "scans", n_workers=1)
-    assert found == (0, 0, [])
+    assert sync(gallery, now(), tmp_path / "scans", n_workers=1) == (0, 0, [])
     table.write_text('{"1": "bar", "2": "block"}')
-    found = sync(gallery, now(), tmp_path / "scans", n_workers=1)
-    assert found == (2, 0, [])
+    assert sync(gallery, now(), tmp_path / "scans", n_workers=1) == (2, 0, [])
     after = {row["part"]: row["volume"] for row in gallery.rows("part", "volume")}
     assert after == {"block": before["bar"], "bar": before["block"]}
 
@@ -454,8 +446,7 @@ def test_a_folder_linked_twice_gives_each_body_once(root, tmp_path):
     )
     assert names_in(gallery) == names
     version = gallery.table.table.version
-    found = sync(gallery, dataset, root, n_workers=1)
-    assert found == (0, 0, [])
+    assert sync(gallery, dataset, root, n_workers=1) == (0, 0, [])
     assert gallery.table.table.version == version
     gallery.remove("class = 'egg'")
     gallery.add(dataset, n_workers=1)
@@ -501,10 +492,8 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path):
     assert len(gallery) == 6
     labels[labels == 3] = 0
     write_nifti(scan, labels)
-    found = sync(gallery, now(), tmp_path / "scans", n_workers=1)
-    assert found == (2, 1, [])
-    found = sorted(row["part"] for row in gallery.rows("part"))
-    assert found == ["1", "1", "2", "2", "3"]
+    assert sync(gallery, now(), tmp_path / "scans", n_workers=1) == (2, 1, [])
+    assert sorted(row["part"] for row in gallery.rows("part")) == ["1", "1", "2", "2", "3"]
 
 
 def test_numbers_stay_as_they_are_written_in_a_column_of_text(root, tmp_path):
@@ -520,11 +509,9 @@ def test_numbers_stay_as_they_are_written_in_a_column_of_text(root, tmp_path):
         n_workers=1,
     )
     gallery.add(eggs, n_workers=1)
-    found = {row["age"] for row in gallery.rows("age")}
-    assert found == {"old", "young", "03", "4", None}
+    assert {row["age"] for row in gallery.rows("age")} == {"old", "young", "03", "4", None}
     version = gallery.table.table.version
-    found = sync(gallery, eggs, root / "egg", n_workers=1)
-    assert found == (0, 0, [])
+    assert sync(gallery, eggs, root / "egg", n_workers=1) == (0, 0, [])
     assert gallery.table.table.version == version
 
 

@@ -127,8 +127,7 @@ def test_the_nearest_of_many_are_those_of_all(tmp_path):
             exact=True,
         )
         assert numbers(found) == exact.indices[i].tolist()
-        expected = exact.distances[i]
-        assert_close(found[1], expected, rtol=1e-5, atol=1e-6)
+        assert_close(found[1], exact.distances[i], rtol=1e-5, atol=1e-6)
 
 
 def test_a_condition_keeps_what_numpy_keeps(tmp_path):
@@ -176,8 +175,7 @@ def test_vectors_of_any_length_are_searched(tmp_path):
     table = written(tmp_path / "g.igps", rows, "cosine")
     assert recall(table, rows[:40], rows, cosine) == 1
     (expected,) = search(rows[:1], rows, top=1500, distance=cosine).indices.tolist()
-    found = numbers(table.nearest(rows[:1], cosine, top=1500))
-    assert found == expected
+    assert numbers(table.nearest(rows[:1], cosine, top=1500)) == expected
 
 
 def test_long_descriptions_are_kept_in_half_precision(tmp_path):

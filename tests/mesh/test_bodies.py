@@ -62,8 +62,7 @@ def test_six_copies_on_a_plate_are_six_bodies_in_its_unit(tmp_path):
         assert body.volume == pytest.approx(1 / 6)
         assert body.unit == "in"
     assert len(load_bodies(path, PIECES)) == 6
-    found = load_mesh(path, OBJECTS, part="part (3)").vertices[:, 0].min()
-    assert found == 6
+    assert load_mesh(path, OBJECTS, part="part (3)").vertices[:, 0].min() == 6
     assert len(read_surface(path).faces) == 24
 
 
@@ -127,8 +126,7 @@ def test_objects_of_an_obj_file_are_bodies_and_without_them_its_groups(tmp_path)
     path = tmp_path / "objects.obj"
     path.write_text(text, encoding="utf-8")
     assert parts(path, OBJECTS) == ["größe", "same", "same (2)"]
-    found = [len(body.vertices) for body in load_bodies(path, OBJECTS)]
-    assert found == [8, 8, 8]
+    assert [len(body.vertices) for body in load_bodies(path, OBJECTS)] == [8, 8, 8]
     assert load_mesh(path, OBJECTS, part="same").volume == pytest.approx(2)
     path.write_text(text.replace("o ", "g "), encoding="utf-8")
     assert parts(path, OBJECTS) == ["größe", "same"]
@@ -148,9 +146,7 @@ def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path):
     whole.export(tmp_path / "boxes.ply")
     assert parts(tmp_path / "boxes.ply", PIECES) == ["piece 1", "piece 2", "piece 3"]
     bodies = load_bodies(tmp_path / "boxes.ply", PIECES)
-    found = [body.volume for body in bodies]
-    expected = [1, 27, 8]
-    assert_allclose(found, expected, rtol=1e-6)
+    assert_allclose([body.volume for body in bodies], [1, 27, 8], rtol=1e-6)
     for body in bodies:
         assert "left out 1 speck" in body.notes
     # Used by no face
@@ -230,9 +226,7 @@ def test_solids_of_a_step_file_are_bodies_in_millimetres(unit, scale, tmp_path):
     )
     assert volumes == expected
     assert {body.unit for body in bodies.values()} == {"mm"}
-    found = bodies["pair (2)"].vertices.max(axis=0) / scale
-    expected = pytest.approx([12, 2, 2], rel=1e-6)
-    assert found == expected
+    assert bodies["pair (2)"].vertices.max(axis=0) / scale == pytest.approx([12, 2, 2], rel=1e-6)
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(MeshError, match=r"parts\.step: OpenCASCADE finds no solid in it"):
         load_mesh(path)

@@ -165,8 +165,7 @@ def test_eigenfunctions_of_the_outside_go_on_through_the_wall():
     assert_allclose(hollow.eigenvalues, full.eigenvalues, rtol=1e-6)
     for samples in (hollow.interior, hollow.surface):
         squares = np.square(samples.eigenfunctions[:, :3]).sum(axis=1) * 4 * np.pi / 3
-        expected = np.square(samples.points).sum(axis=1)
-        assert_allclose(squares, expected, rtol=0.03)
+        assert_allclose(squares, np.square(samples.points).sum(axis=1), rtol=0.03)
 
 
 def test_the_outer_surface_has_vertices_enough_whatever_the_cavity_has():
@@ -190,11 +189,8 @@ def test_a_file_is_read_with_its_cavities_where_they_are_kept(tmp_path):
         rel=1e-6,
     )
     assert kept.volume == expected
-    expected = pytest.approx(BALL.volume, rel=1e-6)
-    assert load_mesh(tmp_path / "hollow.off").volume == expected
-    found = LoadOptions(cavities="keep").as_dict()
-    expected = {**LoadOptions().as_dict(), "cavities": "keep"}
-    assert found == expected
+    assert load_mesh(tmp_path / "hollow.off").volume == pytest.approx(BALL.volume, rel=1e-6)
+    assert LoadOptions(cavities="keep").as_dict() == {**LoadOptions().as_dict(), "cavities": "keep"}
     with pytest.raises(ValueError, match="cavities: expected one of fill, keep, got 'leave'"):
         LoadOptions(cavities="leave")
 
@@ -215,9 +211,7 @@ def test_a_label_keeps_its_cavities():
     )
     assert hollow.area == expected
     full = voxel_surface(mask)
-    found = signed_volume(*full[:2])
-    expected = pytest.approx(np.count_nonzero(radius < 16), rel=0.01)
-    assert found == expected
+    assert signed_volume(*full[:2]) == pytest.approx(np.count_nonzero(radius < 16), rel=0.01)
     assert notes != full[2]
 
 

@@ -76,8 +76,7 @@ def test_comments_may_be_in_any_encoding(tmp_path, suffix, comment, encoding):
     assert_array_equal(mesh.faces, surface.faces)
     (tmp_path / "cloud.xyz").write_bytes(f"# {words}\n0 0 1\n0 1 0\n".encode(encoding))
     cloud = read_surface(tmp_path / "cloud.xyz")
-    expected = [[0, 0, 1], [0, 1, 0]]
-    assert cloud.vertices.tolist() == expected
+    assert cloud.vertices.tolist() == [[0, 0, 1], [0, 1, 0]]
 
 
 def test_a_byte_order_mark_costs_no_vertex(tmp_path):
@@ -294,8 +293,7 @@ def test_each_fault_is_mended_at_any_scale(tmp_path, scale):
     faulty = np.vstack([faulty, faulty[7], [[0, 0, 1]]])
     vertices = np.vstack([vertices, vertices[faces[5, 0]], [[4, 4, 4]]]) * scale
     mesh = load_mesh(write_off(tmp_path / "faulty.off", vertices, faulty))
-    expected = pytest.approx(surface.volume * scale**3, rel=1e-6)
-    assert mesh.volume == expected
+    assert mesh.volume == pytest.approx(surface.volume * scale**3, rel=1e-6)
     assert len(mesh.vertices) == len(surface.vertices)
     said = " ".join(mesh.notes)
     for word in ("welded 1", "degenerate", "duplicate", "unreferenced", "orient"):
@@ -338,8 +336,7 @@ def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(tmp_path, suffix, 
     path = tmp_path / f"cloud.{suffix}"
     path.write_text("\n".join(lines) + "\n")
     mesh = load_mesh(path)
-    expected = pytest.approx(4 / 3 * np.pi * 1.04, rel=0.02)
-    assert mesh.volume == expected
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * 1.04, rel=0.02)
     assert mesh.genus == 0
     assert any("watertight" in note for note in mesh.notes)
     with pytest.raises(MeshError, match=r"cloud.*no faces"):

@@ -90,8 +90,7 @@ def test_genus_and_diagonal():
         (weld_gap(horseshoe()), 1),
     ):
         assert mesh.genus == surface_genus(mesh) == expected
-    found = Mesh(TETRAHEDRON * [1, 2, 2], FACES).diagonal
-    assert found == pytest.approx(3)
+    assert Mesh(TETRAHEDRON * [1, 2, 2], FACES).diagonal == pytest.approx(3)
     with pytest.raises(MeshError, match="open surface has no genus"):
         _ = Mesh(TETRAHEDRON, FACES[:3], allow_open=True).genus
 
@@ -101,8 +100,7 @@ def test_numbered_by_faces_is_the_same_surface_whatever_the_numbers(blob):
     rank = np.argsort(order)
     found = blob.numbered_by_faces()
     again = Mesh(blob.vertices[order], rank[blob.faces]).numbered_by_faces()
-    expected = blob.vertices[blob.faces]
-    assert_array_equal(found.vertices[found.faces], expected)
+    assert_array_equal(found.vertices[found.faces], blob.vertices[blob.faces])
     assert_array_equal(found.vertices, again.vertices)
     assert_array_equal(found.faces, again.faces)
     assert found.numbered_by_faces().faces.tolist() == found.faces.tolist()
@@ -185,8 +183,7 @@ def test_voxels_of_one_label_are_a_mesh():
     for thing, spacing, unit in ((image, None, "mm"), (ball, (1, 1, 2), "mm"), (ball, None, None)):
         mesh = as_mesh(thing, spacing)
         sides = 1 if unit is None else 2
-        expected = pytest.approx(sides * ball.sum(), rel=1e-3)
-        assert mesh.volume == expected
+        assert mesh.volume == pytest.approx(sides * ball.sum(), rel=1e-3)
         assert mesh.name == "volume"
         assert mesh.unit == unit
     with pytest.raises(

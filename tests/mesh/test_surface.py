@@ -65,8 +65,7 @@ def test_edges(blob):
     edges, edge_of = surface.undirected_edges(blob.faces, n_vertices)
     sides = [(int(face[i]), int(face[(i + 1) % 3])) for face in blob.faces for i in range(3)]
     start, end = surface.directed_edges(blob.faces)
-    found = np.column_stack([start, end]).tolist()
-    assert found == [list(side) for side in sides]
+    assert np.column_stack([start, end]).tolist() == [list(side) for side in sides]
     expected = sorted({(min(side), max(side)) for side in sides})
     assert edges.tolist() == [list(edge) for edge in expected]
     assert_array_equal(edges[edge_of], np.sort(sides, axis=1))
@@ -96,5 +95,4 @@ def test_parts_of_faces_and_their_areas():
         part,
         np.repeat([0, 1, 2], [len(piece.faces) for piece in pieces])[shuffled],
     )
-    expected = [piece.area for piece in pieces]
-    assert_allclose(areas, expected, rtol=1e-12)
+    assert_allclose(areas, [piece.area for piece in pieces], rtol=1e-12)

@@ -31,10 +31,8 @@ def test_boxes_that_overlap_are_one_body_of_the_right_volume_and_area():
     body = mend(*surface)
     assert repair_steps(body.notes) == ("united",)
     # The second box reaches 0.7 into the first.
-    expected = 2 + 1.0 * 0.5 * 0.5
-    assert_allclose(body.volume, expected, rtol=1e-12)
-    expected = 10 + 4 * 0.5 * 1.0
-    assert_allclose(body.area, expected, rtol=1e-12)
+    assert_allclose(body.volume, 2 + 1.0 * 0.5 * 0.5, rtol=1e-12)
+    assert_allclose(body.area, 10 + 4 * 0.5 * 1.0, rtol=1e-12)
 
 
 def test_parts_that_do_not_touch_or_are_open_are_left_to_the_grid():
@@ -73,6 +71,4 @@ def test_two_halves_with_a_wall_each_that_overlap_are_the_body_that_they_were_cu
         halves.append((vertices, np.asarray(half.tri_verts, np.int64)))
     body = mend(*together(*halves))
     assert "watertight" not in repair_steps(body.notes)
-    found = (body.volume, body.area)
-    expected = (shape.volume, shape.area)
-    assert_allclose(found, expected, rtol=1e-9)
+    assert_allclose((body.volume, body.area), (shape.volume, shape.area), rtol=1e-9)

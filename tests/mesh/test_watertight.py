@@ -122,9 +122,7 @@ def test_a_missing_base_is_no_leak_beyond_the_bounding_box():
     body = watertight(np.asarray(surface.vertices), faces, resolution=64)
     assert_closed(body)
     assert body.volume == pytest.approx(4, rel=0.03)
-    found = np.ptp(body.vertices[:, 2])
-    expected = pytest.approx(4, abs=0.05)
-    assert found == expected
+    assert np.ptp(body.vertices[:, 2]) == pytest.approx(4, abs=0.05)
 
 
 def test_the_neck_of_a_bottle_is_closed_unless_its_wall_has_two_sides():
@@ -148,8 +146,7 @@ def test_the_neck_of_a_bottle_is_closed_unless_its_wall_has_two_sides():
         (0.0, 0.06),
     ]
     vase = watertight(*turned_profile(outer + inner), resolution=64)
-    found = is_inside(vase, (0, 0, 0.8), (0, 0, 2.0))
-    assert found == [False, False]
+    assert is_inside(vase, (0, 0, 0.8), (0, 0, 2.0)) == [False, False]
     found = is_inside(
         vase,
         (0, 0, 0.03),
@@ -178,8 +175,7 @@ def test_overlapping_parts_are_one():
     second.apply_translation([0.6, 0.3, 0.2])
     body = watertight(*arrays(first, second))
     assert_closed(body)
-    expected = pytest.approx(2 - 0.4 * 0.7 * 0.8, rel=0.01)
-    assert body.volume == expected
+    assert body.volume == pytest.approx(2 - 0.4 * 0.7 * 0.8, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -211,8 +207,7 @@ def test_parts_are_turned_outward_by_their_winding_numbers(turned):
     )
     inside = (-10, 0, 0), (0, 10, 0), (0, 10 * np.cos(1.2), 10 * np.sin(1.2))
     assert is_inside(body, *inside) == [True] * 3
-    found = is_inside(body, (0, 0, 0), (0, 0, 9))
-    assert found == [False] * 2
+    assert is_inside(body, (0, 0, 0), (0, 0, 9)) == [False] * 2
 
 
 @pytest.mark.parametrize("number", [6, 7])
@@ -279,8 +274,7 @@ def test_pieces_are_joined_and_specks_dropped():
         resolution=64,
     )
     assert_closed(apart)
-    expected = pytest.approx(BALL * (1 + 0.7**3), rel=0.03)
-    assert apart.volume == expected
+    assert apart.volume == pytest.approx(BALL * (1 + 0.7**3), rel=0.03)
     assert any("joined 2 pieces" in note for note in apart.notes)
     speck = watertight(
         *arrays(ball(), ball(0.01, (5, 5, 5))),
@@ -306,9 +300,7 @@ def test_wires_stay_in_one_piece():
     )
     body = watertight(strip, faces)
     assert_closed(body)
-    found = np.ptp(body.vertices, axis=0)
-    expected = np.ptp(strip, axis=0)
-    assert_allclose(found, expected, atol=0.08)
+    assert_allclose(np.ptp(body.vertices, axis=0), np.ptp(strip, axis=0), atol=0.08)
 
 
 @pytest.mark.parametrize("with_normals", [True, False])
@@ -348,10 +340,8 @@ def test_follows_the_surface_when_it_is_moved_and_scaled():
         faces,
         resolution=64,
     )
-    expected = body.vertices * 8 + [16, -32, 64]
-    assert_allclose(moved.vertices, expected, atol=8 * 0.02)
-    expected = pytest.approx(2 * np.pi**2 * 0.09, rel=0.03)
-    assert body.volume == expected
+    assert_allclose(moved.vertices, body.vertices * 8 + [16, -32, 64], atol=8 * 0.02)
+    assert body.volume == pytest.approx(2 * np.pi**2 * 0.09, rel=0.03)
     euler = len(body.vertices) - len(body.faces) // 2
     assert euler == 0
 

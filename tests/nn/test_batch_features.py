@@ -25,8 +25,7 @@ def test_nearest_directions_are_those_of_a_loop():
         mean = targets[nearest].mean(dim=0)
         assert_close(direction, normalize(mean - point, dim=0))
     whole = nearest_directions(points, targets, mask, n_nearest=50)
-    expected = normalize(targets.mean(dim=0) - points, dim=1)
-    assert_close(whole, expected)
+    assert_close(whole, normalize(targets.mean(dim=0) - points, dim=1))
     few = nearest_directions(
         points,
         targets.masked_fill(
@@ -35,8 +34,7 @@ def test_nearest_directions_are_those_of_a_loop():
         ),
         torch.arange(20) < 5,
     )
-    expected = normalize(targets[:5].mean(dim=0) - points, dim=1)
-    assert_close(few, expected)
+    assert_close(few, normalize(targets[:5].mean(dim=0) - points, dim=1))
 
 
 def test_positions_do_not_change_with_scale():
@@ -87,11 +85,9 @@ def test_subsets():
         BatchFeatures(batch, training).of("interior", 9, 5).samples
         for training in (False, False, True, True)
     )
-    found = fixed.mask.sum(dim=1).tolist()
-    assert found == [9, 9]
+    assert fixed.mask.sum(dim=1).tolist() == [9, 9]
     assert torch.equal(fixed.points, again.points)
-    found = drawn.mask.sum(dim=1).tolist()
-    assert found == [5, 5]
+    assert drawn.mask.sum(dim=1).tolist() == [5, 5]
     assert not torch.equal(drawn.points, other.points)
     features = BatchFeatures(batch, training=True)
     assert features.of("interior", 9, 5) is features.of("interior", None, 5)

@@ -88,8 +88,7 @@ def test_meshes_come_to_descriptors_that_need_them(dataset):
         ]
         for i in range(4)
     ]
-    found = describe(dataset, Area(), n_workers=1)
-    assert_allclose(found, expected, rtol=1e-6)
+    assert_allclose(describe(dataset, Area(), n_workers=1), expected, rtol=1e-6)
 
 
 def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(dataset):
@@ -168,9 +167,7 @@ def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset):
         [dataset[i].signature.area for i in (0, 2, 3)],
         rtol=1e-6,
     )
-    found = [failure.path for failure in failures]
-    expected = [dataset.bodies.paths[1]]
-    assert found == expected
+    assert [failure.path for failure in failures] == [dataset.bodies.paths[1]]
     assert "was killed twice" in failures[0].error
 
 

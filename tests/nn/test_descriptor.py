@@ -86,8 +86,7 @@ def test_everything_learns(batch):
     descriptor = learned()
     result = descriptor(batch)
     assert result.shape == (2, 45, 8, 4)
-    found = result.detach().sum(dim=(1, 2, 3))
-    np.testing.assert_allclose(found, 1, atol=1e-6)
+    np.testing.assert_allclose(result.detach().sum(dim=(1, 2, 3)), 1, atol=1e-6)
     (result[0] - result[1]).square().sum().backward()
     parameters = dict(descriptor.named_parameters())
     assert set(parameters) == {
@@ -108,9 +107,7 @@ def test_cells_are_counted_by_part(batch):
     descriptor = combined()
     assert descriptor(batch).shape == (2, sum(descriptor.part_cells))
     assert descriptor.part_cells == (45 * 8 * 4 + 10 * 64, 3 * 6 * 4, 4 * 27, 4 * 27, 6 * 125)
-    found = [len(part) for part in descriptor.parts]
-    expected = [2, 1, 1, 1, 1]
-    assert found == expected
+    assert [len(part) for part in descriptor.parts] == [2, 1, 1, 1, 1]
     assert paper().part_cells == (640,)
 
 
@@ -143,8 +140,7 @@ def test_parts_have_their_shares_and_their_histograms_equal_ones(batch, shares, 
         )
     ]
     assert_close(result, torch.cat(expected, dim=1))
-    found = result.sum(dim=1)
-    assert_close(found, torch.ones(2))
+    assert_close(result.sum(dim=1), torch.ones(2))
 
 
 class Counting(SpectralEmbedding):
@@ -177,8 +173,7 @@ def test_subset_of_samples_is_the_same_in_any_batch(batch):
     descriptor = HistogramDescriptor(small(5, 2, n_samples=5))
     together = descriptor(batch)
     for i in range(2):
-        found = descriptor(alone(batch, i))[0]
-        assert_close(found, together[i])
+        assert_close(descriptor(alone(batch, i))[0], together[i])
     assert not torch.allclose(together, HistogramDescriptor(small(5, 2))(batch))
 
 
@@ -317,9 +312,7 @@ def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch):
 def test_coordinates_of_histograms_are_their_roots(batch):
     """As Hellinger's distance takes them; those of others are the descriptions."""
     histograms = paper()(batch)
-    found = paper().coordinates(histograms).square()
-    expected = histograms.flatten(1)
-    assert_close(found, expected)
+    assert_close(paper().coordinates(histograms).square(), histograms.flatten(1))
     kept = EmbeddedDescriptor(paper(), WhitenedHead())
     assert kept.coordinates(histograms.flatten(1)).equal(histograms.flatten(1))
 

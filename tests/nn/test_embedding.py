@@ -78,8 +78,7 @@ def test_keeps_the_first_eigenpairs(spectrum):
     assert torch.equal(
         spectral_embedding(functions, values, n_eigenpairs=4), module(functions, values, area)
     )
-    found = SpectralEmbedding(n_eigenpairs=99)(functions, values, area).shape
-    assert found == (20, 12)
+    assert SpectralEmbedding(n_eigenpairs=99)(functions, values, area).shape == (20, 12)
 
 
 def test_learned_filter_interpolates_its_knots_in_log():

@@ -69,6 +69,4 @@ def test_a_classifier_is_as_precise_as_its_layers():
 
 def test_a_fixed_descriptor_leaves_only_the_layer_to_train():
     model = Classifier(igps.descriptor("interior"), 5)
-    found = [tuple(one.shape) for one in model.parameters()]
-    expected = [(5, 640), (5,)]
-    assert found == expected
+    assert [tuple(one.shape) for one in model.parameters()] == [(5, 640), (5,)]

@@ -108,9 +108,7 @@ def test_names_of_axes_and_what_was_fitted_are_kept():
     own.scale = 0.3
     own.card = {"author": "me"}
     learned = igps.descriptor(own, learnable=True)
-    found = learned(two_bodies()).detach()
-    expected = own(two_bodies())
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(learned(two_bodies()).detach(), own(two_bodies()))
     assert learned.scale == 0.3
     assert learned.card == {"author": "me"}
     assert len(list(learned.parameters())) == 6

@@ -117,8 +117,7 @@ def test_training_moves_bins_filter_and_head_and_is_reproducible(shapes, tmp_pat
     ):
         assert any(part in name for name in moved), part
     for name, value in states[0].items():
-        found = states[1][name]
-        assert_close(found, value, atol=0, rtol=0)
+        assert_close(states[1][name], value, atol=0, rtol=0)
     for name in states[0]:
         assert not name.startswith("scores")
 

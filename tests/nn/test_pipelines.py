@@ -129,8 +129,7 @@ def test_an_exported_program_takes_any_number_of_bodies_and_samples(module):
             SignatureBatch.concatenate([batch, batch[1:]]),
             replace(batch, **fewer),
         ):
-            found = program(*tensors(one))
-            assert_close(found, descriptor(one), rtol=0, atol=1e-6)
+            assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
 
 
 def test_double_precision_stays_double(module):

@@ -121,8 +121,7 @@ def test_a_fitted_head_comes_back_with_its_sizes(tmp_path):
 def test_a_model_saved_twice_is_the_same_file(tmp_path):
     for i in range(8):
         learnable().save(tmp_path / f"{i}.safetensors", {"author": "me"})
-    found = len({path.read_bytes() for path in tmp_path.iterdir()})
-    assert found == 1
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
 
 
 def test_what_was_changed_since_it_was_made_is_not_saved_as_it_was(tmp_path):

@@ -57,13 +57,11 @@ def test_a_wrong_nearest_comes_before_a_right_one():
 
 def test_of_many_the_twenty_worst_and_of_right_ones_none():
     distances, labels = random_collection(60, 5, 30.0, seed=2)
-    found = len(worst_of(distances, labels, tuple(map(str, range(60)))))
-    assert found == 20
+    assert len(worst_of(distances, labels, tuple(map(str, range(60))))) == 20
     together = np.array(
         [[0.0 if one == other else 1.0 for other in labels] for one in labels], dtype=np.float32
     )
-    found = worst_of(together, labels, tuple(map(str, range(60))))
-    assert found == []
+    assert worst_of(together, labels, tuple(map(str, range(60)))) == []
 
 
 def test_each_descriptor_has_its_own(tmp_path):

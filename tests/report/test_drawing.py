@@ -10,9 +10,7 @@ def test_turned_body_is_drawn_alike():
     turned = body.vertices @ trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3].T
     straight = body.vertices @ axes_of(body.vertices)
     back = turned @ axes_of(turned)
-    found = np.ptp(back, axis=0)[1]
-    expected = np.ptp(straight, axis=0)[1]
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    np.testing.assert_allclose(np.ptp(back, axis=0)[1], np.ptp(straight, axis=0)[1], rtol=1e-6)
     for view in (straight, back):
         tip = view[np.argmax(np.linalg.norm(view - view.mean(axis=0), axis=1))]
         assert tip[1] == pytest.approx(view[:, 1].min())  # the slender end is down

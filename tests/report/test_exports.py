@@ -35,8 +35,7 @@ def test_voxels_have_the_grid_of_the_label_image(exported):
     found = SimpleITK.ReadImage(str(folder / "out" / "body.nii.gz"))
     assert found.GetSize() == labels.GetSize()
     for read in ("GetSpacing", "GetOrigin", "GetDirection"):
-        expected = getattr(labels, read)()
-        assert_allclose(getattr(found, read)(), expected, atol=1e-4)
+        assert_allclose(getattr(found, read)(), getattr(labels, read)(), atol=1e-4)
     numbers = SimpleITK.GetArrayFromImage(found)
     assert ((numbers > 0) == (SimpleITK.GetArrayFromImage(labels) > 0)).all()
     inside = mesh.vertices - 1.5 * vertex_normals(mesh.vertices, mesh.faces)  # one voxel
@@ -58,8 +57,7 @@ def test_surfaces_are_in_ras(exported):
     ply = trimesh.load(folder / "out" / "body.ply", process=False)
     assert_allclose(ply.vertices, mesh.vertices)
     assert_array_equal(ply.faces, mesh.faces)
-    found = ply.metadata["_ply_raw"]["vertex"]["data"]["value"]
-    assert_allclose(found, values, 1e-6)
+    assert_allclose(ply.metadata["_ply_raw"]["vertex"]["data"]["value"], values, 1e-6)
     for name in ("body.ply", "body.vtk"):
         assert b"SPACE=RAS" in (folder / "out" / name).read_bytes()[:200]
 

@@ -116,12 +116,9 @@ def test_rankings_and_scores_are_those_of_a_loop(tmp_path):
         scores.per_class()["egg"]["ft"], abs=1e-5
     )
     assert system["per_query"]["nn"][-1] is None  # it has no other of its class
-    found = system["per_query"]["nn"][:-1]
-    expected = scores.nn[:-1].tolist()
-    assert found == expected
+    assert system["per_query"]["nn"][:-1] == scores.nn[:-1].tolist()
     curve = precision_recall_curve(torch.from_numpy(distances), LABELS)
-    expected = pytest.approx(curve.precision.tolist(), abs=1e-5)
-    assert system["curve"][1] == expected
+    assert system["curve"][1] == pytest.approx(curve.precision.tolist(), abs=1e-5)
 
 
 def test_names_from_files_are_harmless_everywhere(page):
@@ -139,8 +136,7 @@ def test_names_from_files_are_harmless_everywhere(page):
     for told in (*NAMES, EVIL, NOTE, "bad<b>.off: it is open."):
         assert "".join(told.split()) in text
     assert "49/c.off" not in page
-    found = [shape["name"] for shape in seen.data()["shapes"]]
-    assert found == list(NAMES)
+    assert [shape["name"] for shape in seen.data()["shapes"]] == list(NAMES)
     assert seen.data()["classes"] == sorted(set(LABELS))
 
 
@@ -191,8 +187,7 @@ def test_without_classes_only_rankings(tmp_path):
     ids = {attributes.get("id") for _, attributes in seen.elements}
     assert {"shapes", "unused", "repaired"} <= ids
     assert not {"scores", "confusion", "precision-recall", "worst"} & ids
-    found = sum(attributes.get("class") == "shape" for _, attributes in seen.elements)
-    assert found == len(NAMES)
+    assert sum(attributes.get("class") == "shape" for _, attributes in seen.elements) == len(NAMES)
 
 
 @pytest.mark.parametrize("kind", ["classes of one", "one class", "several"])
@@ -234,11 +229,8 @@ def test_a_comparison_has_all_descriptors(tmp_path):
     seen = Elements(render_page(read_results(comparison_folder(tmp_path / "compare")), {}))
     systems = seen.data()["systems"]
     assert [system["name"] for system in systems] == ["interior", "gps"]
-    found = [len(system["shapes"]) for system in systems]
-    expected = [len(NAMES), len(NAMES) - 1]
-    assert found == expected
-    found = sum(tag == "option" and a.get("value") in ("0", "1") for tag, a in seen.elements)
-    assert found == 2
+    assert [len(system["shapes"]) for system in systems] == [len(NAMES), len(NAMES) - 1]
+    assert sum(tag == "option" and a.get("value") in ("0", "1") for tag, a in seen.elements) == 2
     assert "gps it has no surface." in seen.text
     assert "all it is open." in seen.text
     assert "7 shapes in 3 classes, 2 descriptors" in seen.text

@@ -113,8 +113,7 @@ class Visit:
         self.context.close()
         if failure[0] is None:
             assert self.complaints == []
-            found = {url for url in self.requests if not url.startswith("data:")}
-            assert found == {self.address}
+            assert {url for url in self.requests if not url.startswith("data:")} == {self.address}
 
     def wait_until(self, is_so):
         """The page's policy forbids the waiting of Playwright's own, which evaluates text in the page."""
@@ -210,9 +209,7 @@ def test_the_map_has_the_places_of_the_distances_and_tells_the_one_under_the_mou
     places = places_on_the_map(answers)
     points = body_map(distances_of(0)).points
     scale = np.ptp(places[:, 0]) / np.ptp(points[:, 0])
-    found = np.diff(places[:, 0])
-    expected = pytest.approx(scale * np.diff(points[:, 0]), abs=1)
-    assert found == expected
+    assert np.diff(places[:, 0]) == pytest.approx(scale * np.diff(points[:, 0]), abs=1)
     found = np.diff(places[:, 1])
     expected = pytest.approx(
         -scale * np.diff(points[:, 1]),
@@ -245,8 +242,7 @@ def test_a_brush_selects_what_lies_in_it(answers):
     assert selected(answers) == set(order[:3].tolist())
     assert answers.page.locator("#map-chosen").inner_text() == "3 selected"
     shown = answers.page.locator("#map-selected .name").all_inner_texts()
-    expected = sorted(NAMES[i] for i in order[:3])
-    assert sorted(shown) == expected
+    assert sorted(shown) == sorted(NAMES[i] for i in order[:3])
     answers.page.keyboard.down("Shift")
     mouse.move(places[order[-1], 0] - 3, low[1])
     mouse.down()
@@ -478,9 +474,7 @@ def test_a_click_shows_the_ranking(retrieval):
         key=lambda j: distances[query, j],
     )
     cards = dialog.locator("#ranking-list .shape")
-    found = cards.locator(".name").all_inner_texts()
-    expected = [NAMES[j] for j in order]
-    assert found == expected
+    assert cards.locator(".name").all_inner_texts() == [NAMES[j] for j in order]
     for place, j in enumerate(order):
         told = cards.nth(place).inner_text()
         assert str(place + 1) in told
@@ -538,8 +532,7 @@ def test_search_and_filter(retrieval):
     page.locator("#only").select_option("missed")
     missed = retrieval.shown()
     page.locator("#only").select_option("found")
-    found = sorted([*missed, *retrieval.shown(), NAMES[-1]])
-    assert found == sorted(NAMES)
+    assert sorted([*missed, *retrieval.shown(), NAMES[-1]]) == sorted(NAMES)
 
 
 def test_a_body_turns(retrieval):
@@ -660,8 +653,7 @@ def test_the_worst_confusions_follow_the_descriptor(browser, folder):
                     (j for j in range(n) if j != query), key=lambda j: distances[query, j]
                 )
                 wrong = [order[rank - 1] for rank in one["wrong"]]
-                found = row.locator(".name").all_inner_texts()
-                assert found == [NAMES[j] for j in (query, *wrong)]
+                assert row.locator(".name").all_inner_texts() == [NAMES[j] for j in (query, *wrong)]
                 assert row.locator(".name + .about").all_inner_texts() == [
                     LABELS[j] for j in (query, *wrong)
                 ]
@@ -748,9 +740,7 @@ def test_confusion_and_sorted_scores(retrieval):
     values = [
         text for text in table.locator("tbody td:nth-child(4)").all_inner_texts() if text != "–"
     ]
-    found = [float(value) for value in values]
-    expected = sorted(map(float, values))
-    assert found == expected
+    assert [float(value) for value in values] == sorted(map(float, values))
     assert table.locator("thead th[aria-sort=ascending]").inner_text().startswith("FT")
 
 

@@ -30,9 +30,7 @@ def test_a_surface_keeps_the_form_with_few_vertices():
     one = surface_of(mesh, compute_signature(mesh, CONFIG), 150)
     assert 100 < len(one.vertices) <= 150
     points = one.vertices / 65535
-    found = np.ptp(points, axis=0)
-    expected = [1.0 / 2.5, 1.0, 0.7 / 2.5]
-    np.testing.assert_allclose(found, expected, rtol=0.06)
+    np.testing.assert_allclose(np.ptp(points, axis=0), [1.0 / 2.5, 1.0, 0.7 / 2.5], rtol=0.06)
     body = trimesh.Trimesh(points, one.faces, process=False)
     assert body.is_watertight
     assert body.volume == pytest.approx(
@@ -40,8 +38,7 @@ def test_a_surface_keeps_the_form_with_few_vertices():
     )  # positive: not a mirror image
     assert one.n_vertices == 642
     assert one.n_faces == 1280
-    expected = pytest.approx(4 / 3 * np.pi * 1.75, rel=0.02)
-    assert one.volume == expected
+    assert one.volume == pytest.approx(4 / 3 * np.pi * 1.75, rel=0.02)
 
 
 def test_the_potential_is_that_of_the_nearest_samples():

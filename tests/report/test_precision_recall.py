@@ -31,6 +31,5 @@ def test_curves_are_drawn_in_percent_and_told_apart(tmp_path, figures_of):
     assert len(looks) == 12
     assert "%" in axes.get_xlabel()
     assert "%" in axes.get_ylabel()
-    found = [text.get_text() for text in made[0].legends[0].get_texts()]
-    assert found == list(curves)
+    assert [text.get_text() for text in made[0].legends[0].get_texts()] == list(curves)
     assert imread(tmp_path / "deep" / "curves.png").std() > 0.05

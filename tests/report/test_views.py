@@ -141,9 +141,7 @@ def test_bodies_without_a_frame_are_turned_onto_the_first_and_not_mirrored():
         turned.faces[:, ::-1],
     )
     views, (own, moved, other) = common_views([first, turned, mirrored])
-    found = [view.title for view in views]
-    expected = [f"view {number}" for number in range(1, 7)]
-    assert found == expected
+    assert [view.title for view in views] == [f"view {number}" for number in range(1, 7)]
     for view in views:
         assert view.letters == ()
     np.testing.assert_allclose(moved, own, atol=0.02)

@@ -125,8 +125,7 @@ def test_a_query_with_all_that_there_is_ranks_as_the_collection_does(points):
     for query in queries:
         found = rerank_candidates(query[None], gallery, euclidean)
         together = torch.cat([query[None], gallery])
-        expected = rerank(euclidean(together, together))[0, 1:]
-        assert_close(found, expected, rtol=0, atol=1e-9)
+        assert_close(found, rerank(euclidean(together, together))[0, 1:], rtol=0, atol=1e-9)
 
 
 def test_a_query_is_put_in_order_by_its_nearest_alone():

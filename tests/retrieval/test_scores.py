@@ -280,8 +280,7 @@ def test_hand_worked_precision_recall_curve():
     # Hits at ranks 1, 3, 4, 6: precisions 1, 2/3, 3/4, 4/6 at recalls 1/4 … 1, the 2/3 lifted to the 3/4 behind it.
     distances = torch.arange(6.0)[None]
     curve = precision_recall_curve(distances, ["a"], list("abaaba"))
-    expected = pytest.approx([1] * 5 + [3 / 4] * 10 + [4 / 6] * 5)
-    assert curve.precision.tolist() == expected
+    assert curve.precision.tolist() == pytest.approx([1] * 5 + [3 / 4] * 10 + [4 / 6] * 5)
     assert curve.recall.tolist() == [i / 20 for i in range(1, 21)]
     assert curve.n_queries == 1
 

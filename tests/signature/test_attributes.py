@@ -87,8 +87,7 @@ def test_potential_in_a_box_is_the_surface_integral(box):
 
 def test_potential_stays_finite_on_a_vertex(sphere):
     value = electrostatic_potential(sphere, sphere.vertices[:1])
-    expected = np.sqrt(4 * np.pi)
-    assert_allclose(value, expected, rtol=2e-3)
+    assert_allclose(value, np.sqrt(4 * np.pi), rtol=2e-3)
 
 
 def test_attributes_do_not_change_with_scale_or_place(box, points):

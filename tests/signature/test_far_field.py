@@ -179,6 +179,5 @@ def test_where_no_approximation_serves_the_closed_form_does(monkeypatch):
         accuracy=1e-3,
         dtype=np.float64,
     )
-    expected = extend(*mesh, functions, points)
-    assert_allclose(found, expected, atol=1e-12)
+    assert_allclose(found, extend(*mesh, functions, points), atol=1e-12)
     assert settings

@@ -55,8 +55,7 @@ def test_mixed_voronoi_mass_equals_libigl(blob):
             np.array(mesh.faces),
             igl.MASSMATRIX_TYPE_VORONOI,
         )
-        found = laplacian(mesh)[1]
-        np.testing.assert_allclose(found, libigl.diagonal(), rtol=1e-10)
+        np.testing.assert_allclose(laplacian(mesh)[1], libigl.diagonal(), rtol=1e-10)
 
 
 def test_robust_backend_equals_its_library(blob):

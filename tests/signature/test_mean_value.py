@@ -72,8 +72,7 @@ def test_surface_points_are_interpolated_in_their_triangle():
     expected = np.zeros((30, len(vertices)))
     np.put_along_axis(expected, faces[chosen], barycentric, axis=1)
     points = np.einsum("pi,pix->px", barycentric, vertices[faces[chosen]])
-    found = mean_value_coordinates(vertices, faces, points)
-    assert_allclose(found, expected, atol=1e-7)
+    assert_allclose(mean_value_coordinates(vertices, faces, points), expected, atol=1e-7)
 
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-7, 1e-9, 1e-12])
@@ -90,8 +89,7 @@ def test_weights_are_continuous_towards_faces_edges_and_vertices(distance):
     directions /= norm(directions, axis=1, keepdims=True)
     points = np.einsum("pi,pix->px", barycentric, vertices[faces[chosen]]) + distance * directions
     limit = np.einsum("pi,pik->pk", barycentric, functions[faces[chosen]])
-    found = extend(vertices, faces, functions, points)
-    assert_allclose(found, limit, atol=60 * distance + 1e-7)
+    assert_allclose(extend(vertices, faces, functions, points), limit, atol=60 * distance + 1e-7)
     assert np.abs(extend(vertices, faces, vertices, points) - points).max() < 1e-7
 
 
@@ -268,8 +266,7 @@ def test_no_points_give_no_rows():
     mesh = cube()
     none = np.zeros((0, 3))
     assert mean_value_coordinates(*mesh, none).shape == (0, 8)
-    found = extend(*mesh, np.ones((8, 3)), none, accuracy=1e-3).shape
-    assert found == (0, 3)
+    assert extend(*mesh, np.ones((8, 3)), none, accuracy=1e-3).shape == (0, 3)
 
 
 def test_read_only_and_single_precision_input_is_accepted_and_kept():
@@ -279,8 +276,7 @@ def test_read_only_and_single_precision_input_is_accepted_and_kept():
     arrays = vertices.astype(np.float32), faces.astype(np.int32), functions, points
     for array in arrays:
         array.setflags(write=False)
-    found = extend(*arrays, accuracy=1e-2)
-    assert_allclose(found, 1, atol=1e-6)
+    assert_allclose(extend(*arrays, accuracy=1e-2), 1, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -345,8 +341,7 @@ def test_finite_functions_may_sum_to_infinity():
         huge,
         np.zeros((1, 3)),
     )
-    expected = pytest.approx(3e38, rel=1e-6)
-    assert found == expected
+    assert found == pytest.approx(3e38, rel=1e-6)
 
 
 def test_weights_without_a_sum_raise():

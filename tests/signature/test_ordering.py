@@ -52,19 +52,15 @@ def test_places_go_with_the_points_and_leave_signs_and_bases_alone():
     eigenvalues[7:10] = eigenvalues[7]  # a multiplet, of which any basis may come
     expected = ordering_keys(functions, eigenvalues, 1.0)
     order = default_rng(0).permutation(500)
-    found = ordering_keys(functions[order], eigenvalues, 1.0)
-    assert_allclose(found, expected[order], rtol=1e-12)
+    assert_allclose(ordering_keys(functions[order], eigenvalues, 1.0), expected[order], rtol=1e-12)
     signs = np.where(np.arange(30) % 2, -1, 1)
-    found = ordering_keys(functions * signs, eigenvalues, 1.0)
-    assert_allclose(found, expected)
+    assert_allclose(ordering_keys(functions * signs, eigenvalues, 1.0), expected)
     turn = np.linalg.qr(default_rng(1).normal(size=(3, 3)))[0]
     turned = functions.copy()
     turned[:, 7:10] = functions[:, 7:10] @ turn
-    found = ordering_keys(turned, eigenvalues, 1.0)
-    assert_allclose(found, expected, rtol=1e-12)
+    assert_allclose(ordering_keys(turned, eigenvalues, 1.0), expected, rtol=1e-12)
     # Three times as large
-    found = ordering_keys(functions / 3, eigenvalues / 9, 9.0)
-    assert_allclose(found, expected, rtol=1e-12)
+    assert_allclose(ordering_keys(functions / 3, eigenvalues / 9, 9.0), expected, rtol=1e-12)
 
 
 def test_points_of_one_potential_have_different_places():
@@ -79,8 +75,7 @@ def test_points_of_one_potential_have_different_places():
         eigenvalues,
         1.0,
     )
-    expected = np.sort(found)
-    assert_allclose(np.sort(exchanged), expected, rtol=1e-9)
+    assert_allclose(np.sort(exchanged), np.sort(found), rtol=1e-9)
 
 
 def test_spacings_and_area_shares_by_hand():
@@ -110,8 +105,7 @@ def test_systematic_samples_follow_the_sizes():
     for seed in range(3000):
         few = systematic_sample(sizes, 7, default_rng(seed))
         many += np.bincount(few, minlength=50)
-    expected = sizes / ends[-1]
-    assert_allclose(many / 21000, expected, atol=0.004)
+    assert_allclose(many / 21000, sizes / ends[-1], atol=0.004)
 
 
 def bodies():
@@ -208,8 +202,7 @@ def test_subsets_take_equal_steps():
             assert chosen[0] < length / 4
             one = slice(row, row + 1)
             alone = batch.map(lambda values, one=one, length=length: values[one, :length])
-            found = alone.subset(4, seed=0).points[0, :, 0].tolist()
-            assert found == chosen.tolist()
+            assert alone.subset(4, seed=0).points[0, :, 0].tolist() == chosen.tolist()
     drawn = [batch.subset(4, seed=seed).attributes["depth"][0] for seed in range(20)]
     starts = {tuple(values.tolist()) for values in drawn}
     assert len(starts) > 1

@@ -159,8 +159,7 @@ def test_thickness_of_a_box_falls_towards_its_edges_as_its_closed_form():
         )
         low = np.where(to_centres <= r, r, low)
         high = np.where(to_centres <= r, high, r)
-    expected = pytest.approx(2 * low.mean(), rel=0.015)
-    assert found["mean_thickness"] == expected
+    assert found["mean_thickness"] == pytest.approx(2 * low.mean(), rel=0.015)
     assert found["greatest_thickness"] == pytest.approx(0.7, rel=0.01)
 
 

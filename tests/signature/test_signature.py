@@ -51,10 +51,8 @@ def test_shapes_types_and_measures(blob, signature):
     assert signature.interior.eigenfunctions.shape == (n_samples, 40)
     assert signature.interior.eigenfunctions.dtype == np.float32
     assert signature.surface.eigenfunctions.shape == (300, 40)
-    expected = pytest.approx(trimesh.Trimesh(blob.vertices, blob.faces).area)
-    assert signature.area == expected
-    expected = pytest.approx(trimesh.Trimesh(blob.vertices, blob.faces).volume)
-    assert signature.volume == expected
+    assert signature.area == pytest.approx(trimesh.Trimesh(blob.vertices, blob.faces).area)
+    assert signature.volume == pytest.approx(trimesh.Trimesh(blob.vertices, blob.faces).volume)
 
 
 def test_distance_and_potential_equal_the_papers_gram_form(blob, signature):
@@ -93,8 +91,7 @@ def test_barycentroid_of_a_ball_is_its_centre_and_of_a_body_its_least_potential(
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_scale_does_not_matter(blob, signature, scale):
     scaled = compute_signature(Mesh(blob.vertices * scale, blob.faces), CONFIG)
-    found = scaled.eigenvalues * scale**2
-    assert_allclose(found, signature.eigenvalues, rtol=1e-7)
+    assert_allclose(scaled.eigenvalues * scale**2, signature.eigenvalues, rtol=1e-7)
     for samples in ("interior", "surface"):
         assert_allclose(histogram(scaled, samples), histogram(signature, samples), atol=1e-5)
 
@@ -136,8 +133,7 @@ def test_surface_samples_lie_on_the_surface_and_follow_its_area():
     )
     assert on_face.any(axis=1).all()
     share = on_face[on_face.sum(axis=1) == 1].mean(axis=0)
-    expected = np.array([6, 3, 2]) / 11
-    assert_allclose(share, expected, atol=0.012)
+    assert_allclose(share, np.array([6, 3, 2]) / 11, atol=0.012)
 
 
 def test_surface_values_are_interpolated_linearly(blob, signature):
@@ -154,8 +150,7 @@ def test_surface_values_are_interpolated_linearly(blob, signature):
         weights,
         spectrum.eigenfunctions[surface.faces[face]],
     )
-    found = signature.surface.eigenfunctions[:20]
-    assert_allclose(found, expected, atol=1e-4)
+    assert_allclose(signature.surface.eigenfunctions[:20], expected, atol=1e-4)
 
 
 def test_simplified_mesh_gives_a_near_descriptor(sphere):
@@ -163,8 +158,7 @@ def test_simplified_mesh_gives_a_near_descriptor(sphere):
     small = compute_signature(sphere, config)
     full = compute_signature(sphere, CONFIG)
     assert any("simplified" in note for note in small.notes)
-    expected = pytest.approx(full.eigenvalues[0], rel=0.02)
-    assert small.eigenvalues[0] == expected
+    assert small.eigenvalues[0] == pytest.approx(full.eigenvalues[0], rel=0.02)
 
 
 def test_robust_backend_and_seed_are_honoured(blob, signature):
@@ -232,8 +226,7 @@ def test_attributes_are_added_to_samples_and_nothing_else_changes(signature):
     away = samples.points - samples.points.mean(axis=0)
     more = samples.with_attributes({"height": height, "away": away})
     more = more.with_attributes({"height": 2 * height})
-    found = {values.dtype.name for values in more.attributes.values()}
-    assert found == {"float32"}
+    assert {values.dtype.name for values in more.attributes.values()} == {"float32"}
     assert_allclose(more.attributes["height"], 2 * height, rtol=1e-6)
     assert_allclose(more.attributes["away"], away, rtol=1e-6)
     assert more.eigenfunctions is samples.eigenfunctions

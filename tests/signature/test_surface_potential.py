@@ -251,6 +251,5 @@ def test_faces_without_area_add_nothing_and_no_points_give_none():
         surface_potential(vertices, faces, points),
         rtol=1e-5,
     )
-    found = surface_potential(vertices, faces, np.empty((0, 3))).shape
-    assert found == (0,)
+    assert surface_potential(vertices, faces, np.empty((0, 3))).shape == (0,)
     assert (surface_potential(vertices, flat[-2:], points[:2]) == 0).all()

@@ -22,17 +22,13 @@ def test_box_is_filled_exactly():
         resolution=32,
     )
     assert len(points) == 8 * 16 * 32
-    found = np.sort(np.unique(points[:, 0].round(9)))
-    expected = (np.arange(8) - 3.5) / 8
-    np.testing.assert_allclose(found, expected)
+    np.testing.assert_allclose(np.sort(np.unique(points[:, 0].round(9))), (np.arange(8) - 3.5) / 8)
 
 
 def test_volume_of_samples_tends_to_volume(blob):
     resolution = 64
     cell = np.ptp(blob.vertices, axis=0).max() / resolution
-    found = len(interior_samples(blob, resolution)) * cell**3
-    expected = pytest.approx(blob.volume, rel=0.01)
-    assert found == expected
+    assert len(interior_samples(blob, resolution)) * cell**3 == pytest.approx(blob.volume, rel=0.01)
 
 
 def test_radial_law_of_a_ball(sphere):
@@ -55,8 +51,7 @@ def test_inside_equals_libigl_winding_number(make):
         np.array(mesh.faces),
         grid_points(axes),
     )
-    found = inside_grid(mesh, axes).ravel()
-    assert_array_equal(found, winding > 0.5)
+    assert_array_equal(inside_grid(mesh, axes).ravel(), winding > 0.5)
 
 
 def test_grid_lines_through_vertices_and_edges():
@@ -64,8 +59,7 @@ def test_grid_lines_through_vertices_and_edges():
     mesh = as_mesh(trimesh.Trimesh(*_octahedron(), process=False))
     exact = tuple(np.arange(-2, 3) / 2.0 for _ in range(3))
     points = grid_points(exact)
-    expected = np.abs(points).sum(axis=1) < 1 - 1e-9
-    assert_array_equal(inside_grid(mesh, exact).ravel(), expected)
+    assert_array_equal(inside_grid(mesh, exact).ravel(), (np.abs(points).sum(axis=1) < 1 - 1e-9))
 
 
 def _octahedron():
@@ -106,8 +100,7 @@ def test_overlapping_parts_count_as_inside_once_or_twice():
         np.array(mesh.faces),
         grid_points(axes),
     )
-    found = inside_grid(mesh, axes).ravel()
-    assert_array_equal(found, winding > 0.5)
+    assert_array_equal(inside_grid(mesh, axes).ravel(), winding > 0.5)
 
 
 def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(sphere):
@@ -133,9 +126,7 @@ def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(spher
         grid_points(axes),
     )
     clear = np.abs(winding - 0.5) > 1e-6
-    found = inside_grid(bowl, axes).ravel()[clear]
-    expected = (winding > 0.5)[clear]
-    assert_array_equal(found, expected)
+    assert_array_equal(inside_grid(bowl, axes).ravel()[clear], (winding > 0.5)[clear])
 
 
 def test_grid_moves_and_turns_with_the_mesh(blob):
@@ -150,16 +141,14 @@ def test_grid_moves_and_turns_with_the_mesh(blob):
     )
     expected = interior_samples(blob, 20) @ turn.T + shift
     moved = moved[np.lexsort(moved.round(6).T)]
-    expected = expected[np.lexsort(expected.round(6).T)]
-    np.testing.assert_allclose(moved, expected, atol=1e-9)
+    np.testing.assert_allclose(moved, expected[np.lexsort(expected.round(6).T)], atol=1e-9)
 
 
 def test_min_samples_refines_the_grid(blob):
     coarse = interior_samples(blob, 8)
     refined = interior_samples(blob, 8, min_samples=1000)
     assert len(coarse) < 1000 <= len(refined) < 2500
-    found = interior_samples(blob, 8, min_samples=len(coarse))
-    assert_array_equal(found, coarse)
+    assert_array_equal(interior_samples(blob, 8, min_samples=len(coarse)), coarse)
 
 
 def test_body_too_thin_for_the_grid():

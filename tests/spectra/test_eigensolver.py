@@ -40,8 +40,7 @@ def assert_pairs(spectrum, problem, tolerance=1e-07):
     )
     assert (lengths / values).max() <= 2 * tolerance
     products = functions.T @ (mass[:, None] * functions)
-    expected = np.eye(len(values))
-    assert_allclose(products, expected, atol=1e-10)
+    assert_allclose(products, np.eye(len(values)), atol=1e-10)
     assert np.abs(mass @ functions).max() < 1e-9 * np.sqrt(mass.sum())
 
 
@@ -52,8 +51,7 @@ def assert_pairs(spectrum, problem, tolerance=1e-07):
 def test_agrees_with_a_dense_solver(n_eigenpairs, torus_problem, torus_oracle):
     stiffness, mass, positions = torus_problem
     spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions)
-    expected = torus_oracle[0][1 : n_eigenpairs + 1]
-    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+    assert_allclose(spectrum.eigenvalues, torus_oracle[0][1 : n_eigenpairs + 1], rtol=1e-10)
     assert_pairs(spectrum, torus_problem)
 
 
@@ -68,8 +66,7 @@ def test_sphere_has_multiplets_of_odd_size():
         positions=problem[2],
     )
     degree = np.repeat(np.arange(1, 11), 2 * np.arange(1, 11) + 1)[:110]
-    expected = degree * (degree + 1)
-    assert_allclose(spectrum.eigenvalues, expected, rtol=0.045)
+    assert_allclose(spectrum.eigenvalues, degree * (degree + 1), rtol=0.045)
     assert_pairs(spectrum, problem)
 
 
@@ -114,8 +111,7 @@ def test_multiplets_larger_than_the_block():
             problem[1],
             n_eigenpairs,
         )
-        expected = values[1 : n_eigenpairs + 1]
-        assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+        assert_allclose(spectrum.eigenvalues, values[1 : n_eigenpairs + 1], rtol=1e-10)
         assert_pairs(spectrum, problem)
 
 
@@ -124,8 +120,7 @@ def test_more_copies_than_distinct_eigenvalues():
     problem = copies_of_a_patch(n_copies=300, side=2)
     values = np.linalg.eigvalsh(problem[0].toarray())
     spectrum = eigenpairs(problem[0], problem[1], 299)
-    expected = values[1:300]
-    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+    assert_allclose(spectrum.eigenvalues, values[1:300], rtol=1e-10)
     assert_pairs(spectrum, problem)
 
 
@@ -159,8 +154,7 @@ def test_a_large_basis_gives_its_place_to_the_eigenvectors(
     stiffness, mass, positions = torus_problem
     monkeypatch.setattr("igps.spectra._basis.MAX_SINGLE_ENTRIES", 1000)
     spectrum = eigenpairs(stiffness, mass, 130, positions=positions)
-    expected = torus_oracle[0][1:131]
-    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+    assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:131], rtol=1e-10)
     assert_pairs(spectrum, torus_problem)
 
 
@@ -174,8 +168,7 @@ def test_scale_of_the_coordinates(scale, torus_problem):
         50,
         positions=positions * scale,
     )
-    found = other.eigenvalues * scale**2
-    assert_allclose(found, one.eigenvalues, rtol=1e-10)
+    assert_allclose(other.eigenvalues * scale**2, one.eigenvalues, rtol=1e-10)
     assert_pairs(
         other,
         (stiffness, mass * scale**2, positions),
@@ -217,8 +210,7 @@ def test_tiny_meshes(n_vertices):
         np.diag(problem[1]),
         eigvals_only=True,
     )
-    expected = values[1:-1]
-    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-10)
+    assert_allclose(spectrum.eigenvalues, values[1:-1], rtol=1e-10)
     assert_pairs(spectrum, problem)
 
 
@@ -251,8 +243,7 @@ def test_flat_triangles_with_huge_cotangents():
         np.diag(problem[1]),
         eigvals_only=True,
     )
-    expected = values[1:81]
-    assert_allclose(spectrum.eigenvalues, expected, rtol=1e-7)
+    assert_allclose(spectrum.eigenvalues, values[1:81], rtol=1e-7)
 
 
 def fail(*arguments):

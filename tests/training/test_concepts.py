@@ -135,8 +135,7 @@ def test_topology_measures_the_change_of_the_same_pairs(open_ring, tmp_path, cap
     eigenvalues = scipy.linalg.eigvalsh(stiffness.toarray(), np.diag(mass))[1:4]
     rows = re.findall(r"genus (\d), first eigenvalues (.*)$", printed, re.MULTILINE)
     assert [genus for genus, _ in rows] == ["0", "1"]
-    found = [float(x) for x in rows[1][1].split(", ")]
-    assert found == pytest.approx(eigenvalues, rel=1e-3)
+    assert [float(x) for x in rows[1][1].split(", ")] == pytest.approx(eigenvalues, rel=1e-3)
 
     assert imread(out).std() > 0.05
 

@@ -49,9 +49,7 @@ def test_remesh_gives_other_triangles_on_the_same_surface(sphere):
 def test_hole_is_one_patch_of_the_wanted_area(sphere):
     holed = hole(sphere, 0.05, seed=2)
     assert holed.allow_open
-    found = 1 - holed.area / sphere.area
-    expected = pytest.approx(0.05, abs=1 / len(sphere.faces))
-    assert found == expected
+    assert 1 - holed.area / sphere.area == pytest.approx(0.05, abs=1 / len(sphere.faces))
     surface = as_trimesh(holed)
     rim = surface.edges[trimesh.grouping.group_rows(surface.edges_sorted, require_count=1)]
     # One closed rim, at one distance from the middle of the patch: that of a spherical cap of this area, give or take

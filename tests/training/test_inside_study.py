@@ -22,8 +22,7 @@ def test_points_of_a_moved_body_are_moved_back():
         0.0,
     )
     points = default_rng(0).uniform(-0.5, 0.5, (50, 3))
-    found = at_rest(points @ turn.T + [1.0, 2.0, 3.0], pose)
-    np.testing.assert_allclose(found, points, atol=1e-9)
+    np.testing.assert_allclose(at_rest(points @ turn.T + [1.0, 2.0, 3.0], pose), points, atol=1e-9)
 
 
 @pytest.mark.parametrize("shift", [0.0, 3.0])

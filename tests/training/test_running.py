@@ -97,8 +97,7 @@ def test_an_interrupted_run_that_is_resumed_ends_as_one_that_ran_through(root, t
     assert found == expected
     for row, again in zip(rows, curve(tmp_path / "broken"), strict=True):
         numbers = {key: float(value or -1) for key, value in row.items()}
-        expected = pytest.approx({key: float(value or -1) for key, value in again.items()})
-        assert numbers == expected
+        assert numbers == pytest.approx({key: float(value or -1) for key, value in again.items()})
     assert (tmp_path / "whole" / "config.yaml").is_file()
 
 

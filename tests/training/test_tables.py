@@ -27,9 +27,7 @@ def test_a_page_shows_what_was_measured(page):
 
 
 def test_every_result_is_shown():
-    found = {path.stem for path in tables.RESULTS.glob("*.json")}
-    expected = {name for _, name in SHOWN}
-    assert found == expected
+    assert {path.stem for path in tables.RESULTS.glob("*.json")} == {name for _, name in SHOWN}
 
 
 def test_results_become_a_table_of_a_page(tmp_path, monkeypatch):

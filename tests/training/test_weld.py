@@ -93,8 +93,7 @@ def test_facing_vertices_are_the_best_of_all_pairs(make, largest_gap, least_path
     for corner in mesh.faces.T:
         np.add.at(sums, corner, areas)
     unit = sums / norm(sums, axis=1, keepdims=True)
-    found = vertex_normals(mesh.vertices, mesh.faces)
-    np.testing.assert_allclose(found, unit, atol=1e-12)
+    np.testing.assert_allclose(vertex_normals(mesh.vertices, mesh.faces), unit, atol=1e-12)
     way = mesh.vertices[None, :] - mesh.vertices[:, None]
     gap = norm(way, axis=2) + np.eye(len(way))
     along = paths(mesh)

@@ -30,9 +30,7 @@ def test_shape_dna_of_a_sphere_is_known(round_body):
 def test_shape_dna_distance_is_euclidean():
     one = torch.tensor([[1.0, 2.0]])
     two = torch.tensor([[4.0, 6.0], [1.0, 2.0]])
-    found = ShapeDNA().distances(one, two)
-    expected = torch.tensor([[5.0, 0.0]])
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(ShapeDNA().distances(one, two), torch.tensor([[5.0, 0.0]]))
 
 
 def test_fewer_eigenvalues_than_asked_for_are_refused(sphere):

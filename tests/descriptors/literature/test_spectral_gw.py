@@ -88,8 +88,7 @@ def test_distances_are_wasserstein_distances_of_exponent_two(round_signature, bl
         marginals = np.concatenate([rows, columns])
         optimum = linprog(cost.ravel(), A_eq=marginals, b_eq=np.full(32, 1 / 16)).fun
         expected.append(time_weight(time) * np.sqrt(optimum))
-    found = descriptor.distances(*described).item()
-    assert found == pytest.approx(max(expected), rel=1e-4)
+    assert descriptor.distances(*described).item() == pytest.approx(max(expected), rel=1e-4)
     assert max(expected) > 1.5 * min(expected)
 
 

@@ -303,8 +303,7 @@ def test_strips_and_polygons_of_vtk_files(tmp_path):
     (tmp_path / "prism.vtk").write_text(head + text)
     mesh = load_mesh(tmp_path / "prism.vtk")
     assert len(mesh.faces) == 16
-    expected = pytest.approx(2.5 * np.sin(2 * np.pi / 5))
-    assert mesh.volume == expected
+    assert mesh.volume == pytest.approx(2.5 * np.sin(2 * np.pi / 5))
 
 
 FAULTY = {

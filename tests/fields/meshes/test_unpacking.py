@@ -82,8 +82,7 @@ def test_files_in_an_archive_are_bodies_and_none_is_written_outside(name, tmp_pa
     (tmp_path / name).write_bytes(packed(members)[name])
     parts = [body.part for body in list_bodies(tmp_path / name, OBJECTS)]
     assert parts == ["in/box.off", "ball.stl"]
-    found = load_mesh(tmp_path / name, OBJECTS, part="in/box.off").volume
-    assert found == pytest.approx(6)
+    assert load_mesh(tmp_path / name, OBJECTS, part="in/box.off").volume == pytest.approx(6)
     assert len(read_surface(tmp_path / name).faces) == 12 + 80
     assert not outside.exists()
     assert [path.name for path in tmp_path.iterdir()] == [name]

@@ -95,8 +95,7 @@ def test_every_residue_counts_once_in_the_row_of_its_separation() -> None:
     n_pairs = wanted.sum(axis=(1, 2, 3, 4, 5))
     weights = n_pairs / (n_pairs + 2000) / (1 + SEPARATIONS[2:] / 20)
     weights /= weights.sum() * n_pairs
-    expected = wanted * weights[:, None, None, None, None, None]
-    assert_allclose(found, expected, atol=2e-6)
+    assert_allclose(found, wanted * weights[:, None, None, None, None, None], atol=2e-6)
 
 
 def test_short_chains_have_no_far_pairs_and_padding_changes_nothing() -> None:
@@ -109,13 +108,9 @@ def test_short_chains_have_no_far_pairs_and_padding_changes_nothing() -> None:
     )
     fewer = replace(long, interior=kept)
     one, other = fold()(collate([short, fewer]))
-    expected = fold()(collate([short]))[0]
-    torch.testing.assert_close(one, expected)
-    expected = fold()(collate([fewer]))[0]
-    torch.testing.assert_close(other, expected)
-    found = one.flatten(1).sum(dim=1)[-4:].tolist()
-    expected = [0, 0, 0, 0]
-    assert found == expected
+    torch.testing.assert_close(one, fold()(collate([short]))[0])
+    torch.testing.assert_close(other, fold()(collate([fewer]))[0])
+    assert one.flatten(1).sum(dim=1)[-4:].tolist() == [0, 0, 0, 0]
     assert float(one.sum()) == pytest.approx(1)
 
 
@@ -151,9 +146,7 @@ def test_residues_of_other_kinds_change_nothing() -> None:
     wanted = [one[:, :3] @ turn, one[:, 3:6] @ turn, one[:, 6:]]
     assert_allclose(turned, np.column_stack(wanted), atol=1e-9)
     nearest = one[:, 7].astype(int)
-    found = one[:, 3:6]
-    expected = directions_of(residues)[nearest]
-    assert_allclose(found, expected, atol=1e-9)
+    assert_allclose(one[:, 3:6], directions_of(residues)[nearest], atol=1e-9)
 
 
 def test_places_follow_bonds_then_numbers_then_distances() -> None:
@@ -182,8 +175,7 @@ def test_directions_do_not_cross_gaps() -> None:
     found = residue_attribute(molecule, positions, "trace")[:, 3:6]
     x = [1, 0, 0]
     y = [0, 1, 0]
-    expected = [x, x, y, y, y, [0, 0, 0]]
-    assert_allclose(found, expected, atol=1e-12)
+    assert_allclose(found, [x, x, y, y, y, [0, 0, 0]], atol=1e-12)
 
 
 def test_it_is_found_by_name_and_asks_for_a_trace() -> None:

@@ -62,8 +62,7 @@ def test_a_ball_lies_where_the_header_says_whatever_the_order_of_axes(order, tol
         rel=0.01,
     )
     assert mesh.volume == expected
-    expected = pytest.approx(4 * np.pi * 5.5**2, rel=0.01)
-    assert mesh.area == expected
+    assert mesh.area == pytest.approx(4 * np.pi * 5.5**2, rel=0.01)
     assert mesh.unit == "Å"
     assert mesh.genus == 0
     assert "density of at least 0.5" in mesh.notes
@@ -92,8 +91,7 @@ def test_a_box_at_the_border_is_closed_there(tmp_path):
     assert mesh.volume == expected
     assert "at the border of the map: closed there" in mesh.notes
     low = (START + np.array([-0.5, 9.5, 4.5])) * SIDES
-    found = mesh.vertices.min(axis=0)
-    np.testing.assert_allclose(found, low, atol=0.02)
+    np.testing.assert_allclose(mesh.vertices.min(axis=0), low, atol=0.02)
 
 
 def test_dust_is_left_out_and_hollows_are_filled_with_notes(tmp_path):

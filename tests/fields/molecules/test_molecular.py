@@ -124,8 +124,7 @@ def test_an_explanation_names_four_parts_and_their_samples():
     told = explain(molecular(), one, other, weights=[np.ones(len(x.surface)) for x in pair])
     distance = float(molecular().distances(found[:1], found[1:]))
     assert told.distance == pytest.approx(distance, rel=1e-3)
-    expected = pytest.approx(told.distance, rel=1e-6)
-    assert sum(told.parts.values()) == expected
+    assert sum(told.parts.values()) == pytest.approx(told.distance, rel=1e-6)
     assert list(told.parts) == ["form", "fold", "composition", "charges"]
     shares = [one.sum() for of_body in told.samples for one in of_body.values()]
     assert sum(shares) == pytest.approx(told.distance)

@@ -43,8 +43,7 @@ def test_a_ball_has_its_area_and_volume(kind, added, radius):
         kind,
         spacing=0.5,
     )
-    expected = pytest.approx(ball(radius + added), rel=0.01)
-    assert (mesh.area, mesh.volume) == expected
+    assert (mesh.area, mesh.volume) == pytest.approx(ball(radius + added), rel=0.01)
     away = norm(mesh.vertices - [0.1, 0.2, 0.3], axis=1)
     np.testing.assert_allclose(away, radius + added, rtol=0.02)
     assert mesh.unit == "Å"
@@ -77,8 +76,7 @@ def test_where_the_neck_is_too_thin_for_the_grid_or_none_a_thread_adds_hardly_an
     closed_form = np.add(ball(radii[0]), ball(radii[1]))
     if apart < 6:
         closed_form = excluded_of_two(*radii, apart, PROBE)
-    expected = pytest.approx(tuple(closed_form), rel=0.01)
-    assert (mesh.area, mesh.volume) == expected
+    assert (mesh.area, mesh.volume) == pytest.approx(tuple(closed_form), rel=0.01)
     assert mesh.genus == 0
 
 

@@ -88,14 +88,11 @@ def test_atoms_have_the_radii_of_their_elements(tmp_path):
     text = residue(1) + residue(2, "MET", [*ALANINE, *SULFUR])
     (molecule,) = read_molecule(written(tmp_path, text))
     # Bondi 1964
-    found = molecule.radii[:5]
-    expected = [1.55, 1.70, 1.70, 1.52, 1.70]
-    assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(molecule.radii[:5], [1.55, 1.70, 1.70, 1.52, 1.70], atol=1e-6)
     assert molecule.radii[-1] == pytest.approx(1.80)
     assert molecule.residue_names == ("ALA", "MET")
     assert molecule.residue_of.tolist() == [0] * 5 + [1] * 8
-    expected = [[1.46, 0, 3.8], [1.46, 0, 7.6]]
-    assert_allclose(molecule.residue_positions, expected)
+    assert_allclose(molecule.residue_positions, [[1.46, 0, 3.8], [1.46, 0, 7.6]])
     assert molecule.notes == ()
 
 
@@ -147,10 +144,8 @@ def test_a_pqr_file_has_its_own_charges_and_radii(tmp_path):
     rows += "ATOM 3 CA HIE 2A 1.5 0.0 0.0 0.10 2.00\nHETATM 4 O WAT 3 9 9 9 -0.8 1.6\nTER\nEND\n"
     molecules = read_molecule(written(tmp_path, rows, "made.pqr"), "models")
     (molecule,) = molecules
-    expected = [-0.3, 0.3, 0.1]
-    assert_allclose(molecule.charges, expected, rtol=1e-6)
-    expected = [1.85, 0, 2]
-    assert_allclose(molecule.radii, expected, atol=1e-6)
+    assert_allclose(molecule.charges, [-0.3, 0.3, 0.1], rtol=1e-6)
+    assert_allclose(molecule.radii, [1.85, 0, 2], atol=1e-6)
     assert molecule.residue_names == ("ALA", "HIS")
     assert np.isnan(molecule.b_factors).all()
     assert molecule.notes == ("radii and charges are those of the PQR file",)
@@ -180,8 +175,7 @@ def test_charges_are_those_of_residues_at_ph_7(tmp_path):
         text += residue(number, name, [*ALANINE, *side])
     (molecule,) = read_molecule(written(tmp_path, text))
     sums = np.bincount(molecule.residue_of, molecule.charges)
-    expected = [-1, -1, 1, 1, 0.1, 0, -0.5]
-    assert_allclose(sums, expected)
+    assert_allclose(sums, [-1, -1, 1, 1, 0.1, 0, -0.5])
 
 
 def test_models_and_chains_are_bodies_of_their_own(tmp_path):
@@ -191,8 +185,7 @@ def test_models_and_chains_are_bodies_of_their_own(tmp_path):
     assert [len(molecule.radii) for molecule in of_models] == [15] * 20
     assert of_models[19].name == f"{path}#model 20"
     of_chains = read_molecule(path)
-    found = [len(molecule.radii) for molecule in of_chains]
-    assert found == [10, 5] * 20
+    assert [len(molecule.radii) for molecule in of_chains] == [10, 5] * 20
     assert of_chains[1].name == f"{path}#model 1 chain B"
 
 
@@ -209,9 +202,7 @@ def test_an_assembly_is_built_by_its_operators(tmp_path):
     )
     (molecule,) = read_molecule(written(tmp_path, remark + residue(1)), "assembly")
     one = molecule.positions[:5]
-    found = molecule.positions[5:]
-    expected = one * [-1, -1, 1] + [0, 0, 50]
-    assert_allclose(found, expected, atol=1e-4)
+    assert_allclose(molecule.positions[5:], one * [-1, -1, 1] + [0, 0, 50], atol=1e-4)
     (alone,) = read_molecule(written(tmp_path, residue(1)), "assembly")
     assert alone.notes == ("the file defines no assembly: the model was used",)
 
@@ -289,8 +280,7 @@ def test_a_backbone_gets_balls_of_its_side_chains(tmp_path):
     text = "".join(residue(i, name, backbone()) for i, name in enumerate(names, start=1))
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.notes == (COMPLETED.format(2),)
-    found = np.bincount(molecule.residue_of).tolist()
-    assert found == [5, 4, 5]
+    assert np.bincount(molecule.residue_of).tolist() == [5, 4, 5]
     leucine = molecule.positions[0], molecule.radii[0]
     volume = 0.89 * (VOLUMES["LEU"] - VOLUMES["GLY"])
     found = 4 / 3 * np.pi * leucine[1] ** 3
@@ -304,8 +294,7 @@ def test_a_backbone_gets_balls_of_its_side_chains(tmp_path):
         found = np.degrees(np.arccos(cosine))
         expected = pytest.approx(109.5, abs=4)
         assert found == expected
-    found = np.bincount(molecule.residue_of, molecule.charges).tolist()
-    assert found == [0, 0, 1]
+    assert np.bincount(molecule.residue_of, molecule.charges).tolist() == [0, 0, 1]
 
 
 def side_chain(*names):
@@ -331,9 +320,7 @@ def test_a_cut_side_chain_gets_what_it_lacks_at_its_last_atom(n_present, tmp_pat
     ball = cut.positions[0]
     radius = cut.radii[0]
     share = (5 - n_present) / 5
-    found = 4 / 3 * np.pi * radius**3
-    expected = pytest.approx(share * (VOLUMES["LYS"] - VOLUMES["GLY"]))
-    assert found == expected
+    assert 4 / 3 * np.pi * radius**3 == pytest.approx(share * (VOLUMES["LYS"] - VOLUMES["GLY"]))
     alpha = np.array([1.46, 0, 3.8])
     last = np.array(
         [
@@ -353,8 +340,7 @@ def test_names_tell_the_state_of_protonation(tmp_path):
         text = "".join(residue(i, name, atoms) for i, name in enumerate(charges, start=1))
         (molecule,) = read_molecule(written(tmp_path, text))
         sums = np.bincount(molecule.residue_of, molecule.charges)
-        expected = list(charges.values())
-        assert_allclose(sums, expected, atol=1e-12)
+        assert_allclose(sums, list(charges.values()), atol=1e-12)
 
 
 def test_an_atom_that_is_given_twice_counts_once(tmp_path):
@@ -370,8 +356,7 @@ def test_a_trace_has_balls_of_its_residues(tmp_path):
     text = "".join(residue(i, "ASP", ALANINE[1:2]) for i in range(1, 9))
     (molecule,) = read_molecule(written(tmp_path, text))
     assert molecule.notes == ("8 residues of Cα alone: a ball of the residue's volume was used",)
-    found = 4 / 3 * np.pi * molecule.radii**3
-    assert_allclose(found, VOLUMES["ASP"])
+    assert_allclose(4 / 3 * np.pi * molecule.radii**3, VOLUMES["ASP"])
     assert molecule.charges.tolist() == [-1.0] * 8
     assert molecular_surface(molecule).volume > 6 * VOLUMES["ASP"]
 
@@ -404,9 +389,7 @@ def test_unknown_elements_and_residues_are_kept_with_a_note(tmp_path):
         element="Xx",
     )
     (molecule,) = read_molecule(written(tmp_path, residue(1, "QQQ") + odd))
-    found = molecule.radii[5:]
-    expected = [1.55, 1.70, 1.70, 1.52, 1.70, 1.70]
-    assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(molecule.radii[5:], [1.55, 1.70, 1.70, 1.52, 1.70, 1.70], atol=1e-6)
     assert molecule.residue_names == ("QQQ", "ALA")
     assert molecule.notes == (
         "5 atoms without an element: it was inferred from their names",
@@ -454,8 +437,7 @@ def test_a_surface_that_fails_in_any_way_costs_no_other_chain(tmp_path, monkeypa
 def test_b_factors_are_means_over_residues(tmp_path):
     text = Atom(1, "N", 0, 0, 0, b=10).line() + Atom(2, "CA", 1, 0, 0, b=30).line()
     text += residue(2, b=70.0)
-    found = read_molecule(written(tmp_path, text))[0].b_factors.tolist()
-    assert found == [20.0, 70.0]
+    assert read_molecule(written(tmp_path, text))[0].b_factors.tolist() == [20.0, 70.0]
 
 
 PQR_LINE = "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 1.85\n"
@@ -528,8 +510,7 @@ def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path):
         text += f"{row[:12]}{row[12:16].strip():<4}{row[16:66]}\n"
     (molecule,) = read_molecule(written(tmp_path, text))
     # Bondi 1964
-    expected = [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.7, 1.52, 1.55]
-    assert_allclose(molecule.radii, expected, atol=1e-6)
+    assert_allclose(molecule.radii, [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.7, 1.52, 1.55], atol=1e-6)
     # And calcium, which some write as an atom of the polymer, is no residue.
     ion = Atom(9, "CA", 5.0, 5.0, 5.0, residue="CA", place="  99 ", element="CA").line()
     (molecule,) = read_molecule(written(tmp_path, residue(1) + ion))
@@ -554,8 +535,7 @@ def test_models_whose_number_repeats_are_all_read(tmp_path):
     model = f"MODEL        1\n{residue(1)}{residue(2)}ENDMDL\n"
     path = written(tmp_path, 3 * model + "END\n")
     molecules = read_molecule(path, bodies="models")
-    found = [len(molecule.radii) for molecule in molecules]
-    assert found == [10, 10, 10]
+    assert [len(molecule.radii) for molecule in molecules] == [10, 10, 10]
     assert len({molecule.name for molecule in molecules}) == 3
 
 
@@ -577,8 +557,7 @@ def test_ranges_of_residues_are_bodies(tmp_path):
     for part in ("chain A:2-3,6-7", "A:2-3,6-7"):
         found = molecule_of(BodyRef(path, part))
         assert found.residue_labels == ("A 2", "A 3", "A 6", "A 7")
-        expected = pytest.approx(np.full(5, 3.8 * 6))
-        assert found.positions[found.residue_of == 2, 2] == expected
+        assert found.positions[found.residue_of == 2, 2] == pytest.approx(np.full(5, 3.8 * 6))
         assert "residues 2-3,6-7 alone: 4 of 8" in found.notes
     mesh = load_mesh(path, part="A:2-3")
     assert mesh.vertices[:, 2].min() > 3.8 * 2 - 3
@@ -593,8 +572,7 @@ def test_coordinates_of_nine_characters_are_read(tmp_path):
     wide = "-1234.567-2000.25012345.678"
     text = "".join(line[:30] + wide + line[54:] for line in lines)
     (molecule,) = read_molecule(written(tmp_path, text))
-    expected = [[-1234.57, -2000.25, 12345.68]] * 3
-    assert_allclose(molecule.residue_positions, expected, atol=1e-9)
+    assert_allclose(molecule.residue_positions, [[-1234.57, -2000.25, 12345.68]] * 3, atol=1e-9)
     assert molecule.b_factors.tolist() == [20.0] * 3
 
 

@@ -80,8 +80,7 @@ def test_an_attribute_is_a_gaussian_mean_over_residues(name, of_residue):
 def test_b_factors_are_the_molecules_own():
     molecule = peptide("ALA", "GLY", "SER")
     wanted = means_written_out(molecule, [0.0, 1.0, 2.0])
-    found = residue_attribute(molecule, points(), "b_factor")
-    assert_allclose(found, wanted, rtol=1e-9)
+    assert_allclose(residue_attribute(molecule, points(), "b_factor"), wanted, rtol=1e-9)
 
 
 def test_shares_of_kinds_sum_to_one_and_follow_the_names():
@@ -138,16 +137,14 @@ def test_the_potential_of_one_charge_is_that_of_debye_and_hueckel():
     thermal = 4 * np.pi * 8.8541878128e-12 * 78.4 * 1.380649e-23 * 298.15
     bjerrum = 1.602176634e-19**2 / thermal * 1e10
     screened = np.exp(-counted * np.sqrt(0.15) / 3.04)
-    expected = -2 * bjerrum * screened / counted
-    assert_allclose(found, expected, rtol=5e-3)
+    assert_allclose(found, -2 * bjerrum * screened / counted, rtol=5e-3)
 
 
 def test_potentials_add_up():
     molecule = peptide("ASP", "ALA", "LYS")
     expected = screened_potential(peptide("ASP", "ALA", "ALA"), points())
     expected += screened_potential(peptide("ALA", "ALA", "LYS"), points())
-    found = screened_potential(molecule, points())
-    assert_allclose(found, expected)
+    assert_allclose(screened_potential(molecule, points()), expected)
     np.testing.assert_array_equal(screened_potential(peptide("ALA"), points()), 0)
 
 
@@ -156,10 +153,8 @@ def test_many_points_in_blocks_are_as_few_at_once(monkeypatch):
     values = np.arange(8.0).reshape(4, 2)
     whole = residue_means(molecule, points(50), values), screened_potential(molecule, points(50))
     monkeypatch.setattr(module, "_BLOCK_SIZE", 12)
-    found = residue_means(molecule, points(50), values)
-    assert_allclose(found, whole[0])
-    found = screened_potential(molecule, points(50))
-    assert_allclose(found, whole[1])
+    assert_allclose(residue_means(molecule, points(50), values), whole[0])
+    assert_allclose(screened_potential(molecule, points(50)), whole[1])
 
 
 def test_each_attribute_is_known_by_its_name():

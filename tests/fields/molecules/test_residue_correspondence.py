@@ -65,8 +65,7 @@ def test_the_turned_part_has_the_paint_in_both_and_structures_are_superposed(pai
         axis=1,
     )
     told = np.array([float(row["displacement"]) for row in rows]).reshape(2, N_RESIDUES)
-    expected = np.stack([steps, steps])
-    assert_allclose(told, expected, atol=0.02)
+    assert_allclose(told, np.stack([steps, steps]), atol=0.02)
     assert rows[0]["place"] == f"A 1 {SEQUENCE[0]}"
     assert rows[-1]["place"] == f"A 360 {SEQUENCE[-1]}"
     structures = [gemmi.read_structure(str(out / f"explain_{i}.cif"))[0]["A"] for i in (1, 2)]
@@ -94,9 +93,7 @@ def test_the_turned_part_has_the_paint_in_both_and_structures_are_superposed(pai
     ],
 )
 def test_sequences_are_aligned(one, other, pairs):
-    found = aligned(tuple(one), tuple(other)).tolist()
-    expected = [list(pair) for pair in pairs]
-    assert found == expected
+    assert aligned(tuple(one), tuple(other)).tolist() == [list(pair) for pair in pairs]
 
 
 def test_other_sequences_and_other_files_do_not_correspond(tmp_path):

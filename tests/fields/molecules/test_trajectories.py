@@ -61,8 +61,7 @@ def test_each_frame_keeps_places_charges_and_residues(files, tmp_path):
     charges[[N_ARM - 1, -1]] += [0.25, -0.15]
     for path, number, _ in written:
         (molecule,) = read_molecule(path, "models")
-        expected = hinges()[number, : 2 * N_ARM]
-        assert_allclose(molecule.positions, expected, atol=1e-3)
+        assert_allclose(molecule.positions, hinges()[number, : 2 * N_ARM], atol=1e-3)
         assert_allclose(molecule.charges, charges, atol=1e-4)
         assert_allclose(molecule.radii, 1.7)
         assert molecule.residue_labels == ("A 1",)
@@ -75,9 +74,7 @@ def test_the_map_follows_an_opening_hinge(files, tmp_path):
     run("trajectory", *files, "--select", "all", "--out", out, *fast)
     with (out / "trajectory.csv").open() as file:
         rows = list(csv.DictReader(file))
-    found = [int(row["frame"]) for row in rows]
-    expected = [0, 1, 2, 3, 4]
-    assert found == expected
+    assert [int(row["frame"]) for row in rows] == [0, 1, 2, 3, 4]
     away = [float(row["distance_to_first"]) for row in rows]
     assert away == sorted(away)
     assert away[0] == 0

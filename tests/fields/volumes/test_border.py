@@ -73,8 +73,7 @@ def test_no_whole_body_is_told_and_every_cut_one(tmp_path, capsys):
         "half": "S",
         **dict.fromkeys(whole, ""),
     }
-    expected = [name in cut for name in table.index]
-    assert (table["at_border"] > 0).tolist() == expected
+    assert (table["at_border"] > 0).tolist() == [name in cut for name in table.index]
     capsys.readouterr()
     run("extract", tmp_path, "--out", out, "--complete", *words)
     assert "3 of 6 bodies at the border of the image, left out" in capsys.readouterr().out

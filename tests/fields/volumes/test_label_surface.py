@@ -138,8 +138,7 @@ def errors(body, matrix, rng):
         [vertices.min(axis=0), vertices.max(axis=0)],
         axis=0,
     )
-    expected = (100, -50, 20)
-    assert_allclose(centre, expected, atol=np.abs(matrix).max())
+    assert_allclose(centre, (100, -50, 20), atol=np.abs(matrix).max())
     return abs(mesh.volume / body.volume - 1), abs(mesh.area / body.area - 1)
 
 
@@ -191,8 +190,7 @@ def test_many_voxels_are_put_on_a_coarser_grid_and_nothing_is_lost_by_it():
     mesh = Mesh(vertices, faces)
     assert len(mesh.vertices) <= 2000
     assert mesh.volume == pytest.approx(np.count_nonzero(mask), rel=1e-6)
-    expected = pytest.approx(4 * np.pi * 60**2, rel=0.01)
-    assert mesh.area == expected
+    assert mesh.area == pytest.approx(4 * np.pi * 60**2, rel=0.01)
     radius = norm(
         mesh.vertices - (100, -50, 20),
         axis=1,
@@ -273,9 +271,7 @@ def test_a_rib_of_two_voxels_stays_one_body(direction):
     mesh = Mesh(*voxel_surface(mask)[:2])
     assert mesh.genus == 0
     assert mesh.volume == pytest.approx(np.count_nonzero(mask), rel=0.05)
-    found = np.ptp(mesh.vertices @ axis)
-    expected = pytest.approx(32, abs=1.5)
-    assert found == expected
+    assert np.ptp(mesh.vertices @ axis) == pytest.approx(32, abs=1.5)
 
 
 def test_voxels_that_touch_at_a_corner_are_one_piece():
@@ -308,9 +304,7 @@ def test_small_pieces_apart_are_dropped_and_large_ones_stay():
     vertices, faces, notes = voxel_surface(mask)
     assert components(faces, len(vertices))[0] == 2
     assert notes == ("left out 1 small piece apart: 8 voxels, 8, 0.1% of the label",)
-    found = Mesh(*largest(vertices, faces)).volume
-    expected = pytest.approx(16**3, rel=0.01)
-    assert found == expected
+    assert Mesh(*largest(vertices, faces)).volume == pytest.approx(16**3, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -361,8 +355,7 @@ def test_pieces_that_face_each_other_in_a_slant_are_not_filled_up():
     mask &= abs((np.moveaxis(np.indices(mask.shape), 0, -1) - 29.5) @ normal) > 1
     vertices, faces, notes = voxel_surface(mask, joins=True)
     assert notes == ("joined 2 pieces by bars",)
-    expected = pytest.approx(np.count_nonzero(mask), rel=0.01)
-    assert Mesh(vertices, faces).volume == expected
+    assert Mesh(vertices, faces).volume == pytest.approx(np.count_nonzero(mask), rel=0.01)
 
 
 @pytest.mark.parametrize("side", [1.0, 0.6])
@@ -380,9 +373,7 @@ def test_a_bar_is_as_thick_on_every_grid(side):
     (line,) = trimesh.Trimesh(vertices, faces).section([1, 0, 0], [0, 0, 0]).discrete
     _, y, z = line.T
     section = abs(y[1:] @ z[:-1] - y[:-1] @ z[1:]) / 2
-    found = np.sqrt(section / np.pi)
-    expected = pytest.approx(1.5, abs=0.3)
-    assert found == expected
+    assert np.sqrt(section / np.pi) == pytest.approx(1.5, abs=0.3)
 
 
 def test_holes_inside_are_filled():
@@ -390,8 +381,7 @@ def test_holes_inside_are_filled():
     mask[5:7, 5:7, 5:7] = False
     vertices, faces, notes = voxel_surface(mask)
     assert notes == ("filled holes: 8 voxels, 8",)
-    expected = pytest.approx(12**3, rel=1e-3)
-    assert Mesh(vertices, faces).volume == expected
+    assert Mesh(vertices, faces).volume == pytest.approx(12**3, rel=1e-3)
 
 
 def test_what_is_no_body_is_refused_with_its_count():
@@ -420,5 +410,4 @@ def test_a_thin_label_has_the_volume_of_its_voxels():
     sheet = (z == height) & (x > 2) & (x < 20) & (y > 2) & (y < 20)
     vertices, faces, notes = voxel_surface(sheet)
     assert notes == ()
-    expected = pytest.approx(sheet.sum(), rel=5e-3)
-    assert signed_volume(vertices, faces) == expected
+    assert signed_volume(vertices, faces) == pytest.approx(sheet.sum(), rel=5e-3)

@@ -60,8 +60,7 @@ def test_the_numbers_of_well_known_structures():
     ]
     first = tables["totalsegmentator_v1"]
     assert sorted(first) == list(range(1, 105))
-    found = [first[i] for i in (5, 7, 50, 104)]
-    assert found == ["liver", "aorta", "brain", "urinary_bladder"]
+    assert [first[i] for i in (5, 7, 50, 104)] == ["liver", "aorta", "brain", "urinary_bladder"]
     for names in tables.values():
         assert len(set(names.values())) == len(names)
         for word, other in (("Left-", "Right-"), ("_left", "_right"), ("-lh-", "-rh-")):

@@ -163,11 +163,9 @@ def test_every_format_gives_the_same_bodies_in_the_world(name, tmp_path):
         expected = label_surface(given, at)
         found = sorted(mesh.vertices[:, 0])
         assert_allclose(found, sorted(expected.vertices[:, 0]), atol=1e-3)
-        expected = pytest.approx(n_voxels * 1 * 1.5 * 2.5, rel=1e-3)
-        assert mesh.volume == expected
+        assert mesh.volume == pytest.approx(n_voxels * 1 * 1.5 * 2.5, rel=1e-3)
         centre = AFFINE[:3, :3] @ np.argwhere(two_boxes() == at).mean(axis=0) + AFFINE[:3, 3]
-        found = mesh.vertices.mean(axis=0)
-        assert_allclose(found, centre, atol=0.4)
+        assert_allclose(mesh.vertices.mean(axis=0), centre, atol=0.4)
 
 
 def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path):
@@ -182,9 +180,7 @@ def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path):
         metadata=metadata,
     )
     volume = read_label_volume(tmp_path / "x.tif")
-    found = np.diag(volume.affine)
-    expected = [0.5e-3, 0.25e-3, 2e-3, 1]
-    assert_allclose(found, expected)
+    assert_allclose(np.diag(volume.affine), [0.5e-3, 0.25e-3, 2e-3, 1])
     assert volume.unit == "mm"
     assert_array_equal(volume.layers[0], two_boxes())
     tifffile.imwrite(tmp_path / "y.tiff", stack, photometric="minisblack")
@@ -208,8 +204,7 @@ def test_imagej_escapes_units_and_leaves_a_spacing_of_one_out(words, sides, unit
     how = {"photometric": "minisblack", "description": about, "metadata": None}
     tifffile.imwrite(tmp_path / "x.tif", stack, resolution=(2, 4), **how)
     volume = read_label_volume(tmp_path / "x.tif")
-    found = np.diag(volume.affine)[:3]
-    assert_allclose(found, sides)
+    assert_allclose(np.diag(volume.affine)[:3], sides)
     assert volume.unit == unit
     assert_array_equal(volume.layers[0], two_boxes())
 
@@ -218,15 +213,13 @@ def test_pages_that_were_written_one_by_one_are_a_stack(tmp_path):
     with tifffile.TiffWriter(tmp_path / "x.tif") as file:
         for page in np.ascontiguousarray(two_boxes().T):
             file.write(page, photometric="minisblack")
-    found = read_label_volume(tmp_path / "x.tif").layers[0]
-    assert_array_equal(found, two_boxes())
+    assert_array_equal(read_label_volume(tmp_path / "x.tif").layers[0], two_boxes())
 
 
 def test_a_stack_compressed_by_lzw_is_read(tmp_path):
     image = sitk.GetImageFromArray(np.ascontiguousarray(two_boxes().T))
     sitk.WriteImage(image, str(tmp_path / "x.tif"), useCompression=True, compressor="LZW")
-    found = read_label_volume(tmp_path / "x.tif").layers[0]
-    assert_array_equal(found, two_boxes())
+    assert_array_equal(read_label_volume(tmp_path / "x.tif").layers[0], two_boxes())
 
 
 def write_nrrd(path, *lines):
@@ -328,8 +321,7 @@ def test_a_list_of_layers_in_a_nrrd_file_may_be_any_axis(space, axes, last, tmp_
     voxels = np.stack(layers, axis=3 if last else 0).tobytes(order="F")
     (tmp_path / "x.seg.nrrd").write_bytes(header.encode() + b"\n" + voxels)
     volume = read_label_volume(tmp_path / "x.seg.nrrd")
-    expected = [(3, "liver", 384), (7, "spleen", 320)]
-    assert label_bodies(volume) == expected
+    assert label_bodies(volume) == [(3, "liver", 384), (7, "spleen", 320)]
     assert_allclose(volume.affine, AFFINE, atol=1e-9)
 
 
@@ -345,8 +337,7 @@ def test_voxels_beside_their_header(name, tmp_path):
     write_nrrd(tmp_path / "x.nhdr", f"data file: {name}")
     (tmp_path / "x.raw").write_bytes(two_boxes().tobytes(order="F"))
     volume = read_label_volume(tmp_path / "x.nhdr")
-    expected = [(3, "3", 384), (7, "7", 320)]
-    assert label_bodies(volume) == expected
+    assert label_bodies(volume) == [(3, "3", 384), (7, "7", 320)]
     assert label_surface(volume, 3).volume == pytest.approx(1440, rel=1e-3)
     assert dependencies_of(tmp_path / "x.nhdr") == [tmp_path / "x.nhdr", tmp_path / "x.raw"]
 
@@ -364,10 +355,8 @@ def test_segments_of_slicer_have_names_and_may_overlap(tmp_path):
         image.SetMetaData(f"Segment{number}_Layer", str(number))
     sitk.WriteImage(image, str(tmp_path / "x.seg.nrrd"))
     volume = read_label_volume(tmp_path / "x.seg.nrrd")
-    expected = [(1, "liver", 384), (2, "body", 704)]
-    assert label_bodies(volume) == expected
-    expected = pytest.approx(704 * 3.75, rel=1e-3)
-    assert label_surface(volume, "body").volume == expected
+    assert label_bodies(volume) == [(1, "liver", 384), (2, "body", 704)]
+    assert label_surface(volume, "body").volume == pytest.approx(704 * 3.75, rel=1e-3)
 
 
 def test_segments_of_slicer_before_4_11_each_have_a_layer(tmp_path):
@@ -539,8 +528,7 @@ def test_labels_that_were_given_as_numbers_with_a_fraction_are_whole_again(tmp_p
     nibabel.save(image, tmp_path / "x.nii.gz")
     stored = np.asanyarray(nibabel.load(tmp_path / "x.nii.gz").dataobj)
     assert (stored != np.round(stored)).any()
-    expected = [(3, "3", 384), (7, "7", 320)]
-    assert label_bodies(read_label_volume(tmp_path / "x.nii.gz")) == expected
+    assert label_bodies(read_label_volume(tmp_path / "x.nii.gz")) == [(3, "3", 384), (7, "7", 320)]
 
 
 def test_probabilities_are_cut_at_the_threshold(tmp_path):
@@ -556,8 +544,7 @@ def test_probabilities_are_cut_at_the_threshold(tmp_path):
         mesh = label_surface(volume, 1)
         radius[threshold] = (mesh.volume * 3 / 4 / np.pi) ** (1 / 3)
         assert any("probabilities" in note for note in mesh.notes)
-    expected = pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
-    assert radius == expected
+    assert radius == pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
     shares = np.clip(0.9 - ball / 8, 0, 1).astype(np.float32)
     write_nifti(tmp_path / "y.nii", shares)
     words = r"no voxel has a label, all are 0 \(probabilities: .* from 0\.95 on\)\. Check"
@@ -620,8 +607,7 @@ def test_large_labels_are_kept(tmp_path):
         (300_000_000, "300000000", 384),
         (700_000_000, "700000000", 320),
     ]
-    expected = pytest.approx(320 * 3.75, rel=1e-3)
-    assert label_surface(volume, 700_000_000).volume == expected
+    assert label_surface(volume, 700_000_000).volume == pytest.approx(320 * 3.75, rel=1e-3)
 
 
 def nifti(path, values, affine=AFFINE):
@@ -718,8 +704,7 @@ def test_many_labels_as_small_as_they_may_be_are_no_image():
         2,
         2,
     )
-    found = {body.n_voxels for body in LabelVolume((block,), np.eye(4)).bodies}
-    assert found == {8}
+    assert {body.n_voxels for body in LabelVolume((block,), np.eye(4)).bodies} == {8}
 
 
 def test_a_label_in_pieces_is_one_body_on_its_own_grid():
@@ -771,13 +756,9 @@ def test_a_name_that_is_the_number_of_another_label_is_the_name(tmp_path):
         rel=1e-3,
     )
     assert volumes == expected
-    found = load_mesh(tmp_path / "x.nii", part="3").volume
-    expected = pytest.approx(320 * 3.75, rel=1e-3)
-    assert found == expected
+    assert load_mesh(tmp_path / "x.nii", part="3").volume == pytest.approx(320 * 3.75, rel=1e-3)
     volume = read_label_volume(tmp_path / "x.nii")
-    found = [volume.body(part).label for part in (3, 7, "7", "3")]
-    expected = [3, 7, 7, 7]
-    assert found == expected
+    assert [volume.body(part).label for part in (3, 7, "7", "3")] == [3, 7, 7, 7]
 
 
 def test_pieces_of_a_volume_are_what_does_not_touch_whatever_its_label(tmp_path):

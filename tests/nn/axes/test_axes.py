@@ -50,8 +50,7 @@ def test_hats_are_the_linear_kernel():
         values.view(2, 4),
         torch.tensor(centres, dtype=torch.float64),
     )
-    found = in_rows.flatten(0, 1)
-    assert_allclose(found, expected, atol=1e-14)
+    assert_allclose(in_rows.flatten(0, 1), expected, atol=1e-14)
 
 
 def test_hats_are_differentiable_in_both_arguments():
@@ -69,9 +68,7 @@ def test_hats_are_differentiable_in_both_arguments():
 )
 def test_hard_classes_are_those_of_the_nearest_centre(axis):
     values = torch.tensor([0.0, 0.3749, 0.375, 0.7, 0.75, 1.125, 1.5, 9.0])
-    expected = [0, 0, 1, 1, 2, 3, 3, 3]
-    found = axis.memberships(values).tolist()
-    assert found == np.eye(4)[expected].tolist()
+    assert axis.memberships(values).tolist() == np.eye(4)[[0, 0, 1, 1, 2, 3, 3, 3]].tolist()
     assert axis.n_classes == 4
 
 
@@ -92,8 +89,7 @@ def test_members_are_memberships_without_their_zeros(options, depths):
         classes,
         weights.detach(),
     )
-    expected = axis.memberships(values[mask]).detach()
-    torch.testing.assert_close(found[mask], expected)
+    torch.testing.assert_close(found[mask], axis.memberships(values[mask]).detach())
     with pytest.raises(ValueError, match="Attribute: expected finite values, got NaN or infinity"):
         axis.members(values, torch.ones_like(mask))
 
@@ -186,14 +182,12 @@ def test_needs():
     assert PairTwist().requirements(fine) == Requirements(attributes=("surface_direction",))
     assert BallRadius().requirements(fine) == Requirements(attributes=("surface_direction",))
     assert Potential(embedding=coarse).requirements(fine) == Requirements(n_eigenpairs=2)
-    found = Attribute("depth", [0.1]).requirements(fine)
-    assert found == Requirements(attributes=("depth",))
+    assert Attribute("depth", [0.1]).requirements(fine) == Requirements(attributes=("depth",))
     assert Attribute("one of my own", [0.1]).requirements(fine) == Requirements()
 
 
 def test_named_axes_are_made_as_they_are_by_default():
-    found = {name: type(axis_of(name)) for name in AXES}
-    assert found == dict(AXES)
+    assert {name: type(axis_of(name)) for name in AXES} == dict(AXES)
     assert isinstance(axis_of("interior_distance"), PairAxis)
     assert_allclose(
         axis_of("potential").centres(),

@@ -47,8 +47,7 @@ def test_fixed_centres_are_a_copy_and_no_parameters():
     start = torch.tensor([0.1, 0.4])
     centres = OrderedCentres(start)
     start += 1
-    expected = torch.tensor([0.1, 0.4])
-    torch.testing.assert_close(centres(), expected)
+    torch.testing.assert_close(centres(), torch.tensor([0.1, 0.4]))
     assert list(centres.parameters()) == []
 
 

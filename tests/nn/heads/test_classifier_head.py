@@ -25,9 +25,7 @@ def drawn(n_classes, n_of_each, noise=0.6, seed=0):
 def test_folds_hold_out_each_shape_once_and_leave_every_class():
     labels = torch.tensor([4] * 7 + [2] * 3 + [9])
     masks = list(folds(labels))
-    found = torch.stack(masks).sum(dim=0).tolist()
-    expected = [1] * 10 + [0]
-    assert found == expected
+    assert torch.stack(masks).sum(dim=0).tolist() == [1] * 10 + [0]
     for mask in masks:
         assert set(labels[~mask].tolist()) == {2, 4, 9}
     assert list(folds(torch.arange(5))) == []
@@ -38,14 +36,10 @@ def test_scores_are_those_of_the_kernel_head_and_probabilities_their_softmax():
     head = ClassifierHead().fit(histograms, labels, PARTS)
     kernel = KernelHead().fit(histograms, labels, PARTS)
     new, _ = drawn(4, 5, seed=1)
-    found = head.scores(new)
-    expected = kernel.scores(new)
-    assert_close(found, expected, rtol=0, atol=1e-6)
+    assert_close(head.scores(new), kernel.scores(new), rtol=0, atol=1e-6)
     assert_close(head(new), kernel(new), rtol=0, atol=1e-6)
     probabilities = head.probabilities(new)
-    found = probabilities.sum(dim=1)
-    expected = torch.ones(20)
-    assert_close(found, expected)
+    assert_close(probabilities.sum(dim=1), torch.ones(20))
     assert_close(probabilities, (kernel.scores(new) / head.calibration).softmax(dim=1))
 
 
@@ -94,8 +88,7 @@ def test_strangeness_is_what_its_formula_says():
             / head.medians[-1]
         )
         nearest = sorted(distances[labels == 10 + taken_for].tolist())[:2]
-        expected = pytest.approx(sum(nearest) / 2 - float(score), abs=1e-4)
-        assert found == expected
+        assert found == pytest.approx(sum(nearest) / 2 - float(score), abs=1e-4)
 
 
 def test_a_class_that_was_left_out_is_unknown_and_others_are_not():

@@ -79,24 +79,17 @@ def test_parts_are_whitened_one_by_one(collection):
 
 def test_an_unfitted_head_gives_normalised_square_roots(collection):
     """Whatever the number of cells."""
-    found = WhitenedHead()(collection[0])
-    expected = collection[0].sqrt()
-    assert_close(found, expected)
+    assert_close(WhitenedHead()(collection[0]), collection[0].sqrt())
     few = collection[0][:, :7]
-    found = WhitenedHead()(few)
-    expected = normalize(few.sqrt())
-    assert_close(found, expected)
+    assert_close(WhitenedHead()(few), normalize(few.sqrt()))
     stacked = collection[0].view(48, 4, 15)
-    found = WhitenedHead()(stacked)
-    expected = collection[0].sqrt()
-    assert_close(found, expected)
+    assert_close(WhitenedHead()(stacked), collection[0].sqrt())
 
 
 def test_centred_head_damps_nothing(collection):
     histograms, _ = collection
     roots = histograms.sqrt() - histograms.sqrt().mean(dim=0)
-    found = WhitenedHead().centre(histograms)(histograms)
-    assert_close(found, normalize(roots))
+    assert_close(WhitenedHead().centre(histograms)(histograms), normalize(roots))
     parts = [normalize(part) / 2**0.5 for part in roots.split([20, 40], dim=1)]
     in_parts = WhitenedHead().centre(histograms, (20, 40))(histograms)
     assert_close(in_parts, torch.cat(parts, dim=1))
@@ -123,8 +116,7 @@ def test_kernel_head_is_kernel_ridge_regression(collection):
     expected = oracle.predict(kernel[test])
     found = head.scores(histograms[test])
     assert_allclose(found, expected, atol=2e-3)
-    found = head.predict(histograms[test])
-    np.testing.assert_array_equal(found, expected.argmax(axis=1))
+    np.testing.assert_array_equal(head.predict(histograms[test]), expected.argmax(axis=1))
 
 
 def test_identical_shapes_have_no_direction():
@@ -223,9 +215,7 @@ def test_a_prior_stays_as_it_is(collection, prior, kind):
     )
     for name, value in prior.state_dict().items():
         assert_close(value, before[name], rtol=0, atol=0)
-    found = head(histograms).norm(dim=1)
-    expected = torch.ones(48)
-    assert_close(found, expected)
+    assert_close(head(histograms).norm(dim=1), torch.ones(48))
     copy = kind(prior=WhitenedHead())
     copy.load_state_dict(head.state_dict())
     assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
@@ -303,8 +293,7 @@ def test_parts_beside_a_prior_are_weighted_by_fishers_discriminant(collection, s
     expected = 0.7 * own + 0.3 * squared.distances(squared(histograms), squared(histograms)).numpy()
     found = head.distances(vectors, vectors)
     assert_allclose(found, expected, atol=1e-5)
-    found = vectors.norm(dim=1)
-    assert_close(found, torch.ones(48))
+    assert_close(vectors.norm(dim=1), torch.ones(48))
 
 
 class Stretched(Head):
@@ -336,9 +325,7 @@ def test_without_separation_all_parts_have_equal_weights(collection, prior):
         beside = WhitenedHead(prior=prior).fit(shapes, labels, (20, 40))
         assert beside.part_shares.tolist() == [0.5, 0.5]
         alone = WhitenedHead().fit(shapes, labels, (20, 40))(histograms)
-        found = beside(histograms)[:, :N_CELLS]
-        expected = (2 / 3) ** 0.5 * alone
-        assert_close(found, expected)
+        assert_close(beside(histograms)[:, :N_CELLS], (2 / 3) ** 0.5 * alone)
 
 
 @pytest.mark.parametrize("power", [1, 2])
@@ -387,9 +374,7 @@ def test_one_shape_of_each_class_leaves_the_prior_alone(collection, prior):
         np.eye(8),
     )
     head = KernelHead(prior).fit(histograms[::6], labels[::6])
-    found = head.scores(histograms)
-    expected = oracle.predict(kernel)
-    assert_allclose(found, expected, atol=2e-3)
+    assert_allclose(head.scores(histograms), oracle.predict(kernel), atol=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -27,9 +27,7 @@ def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(histograms)
     head = ProjectionHead(width=5, n_hidden=16)
     histograms.requires_grad_()
     embedding = head(histograms)
-    found = embedding.norm(dim=1)
-    expected = torch.ones(12)
-    assert_close(found, expected)
+    assert_close(embedding.norm(dim=1), torch.ones(12))
     embedding[:, 0].sum().backward()
     assert histograms.grad is not None
     assert histograms.grad.isfinite().all()
@@ -46,24 +44,18 @@ def test_linear_head_with_identity_weights_ranks_like_hellingers_distance(histog
     # Of histograms that sum to 1 the square roots are unit vectors; Hellinger's distance is theirs over √2.
     roots = histograms.detach().flatten(1).sqrt()
     squared = torch.cdist(embedding, embedding).square()
-    expected = torch.cdist(roots, roots).square()
-    assert_close(squared, expected, atol=1e-6, rtol=1e-5)
+    assert_close(squared, torch.cdist(roots, roots).square(), atol=1e-6, rtol=1e-5)
 
 
 def test_fit_centres_and_scales(histograms):
     head = ProjectionHead(width=3, n_hidden=0).eval()
     assert head.fit(histograms, torch.zeros(12), part_cells=(4, 20)) is head
     inputs = (histograms.flatten(1).sqrt() - head.mean) / head.scale
-    found = inputs.mean(dim=0)
-    expected = torch.zeros(24)
-    assert_close(found, expected, atol=1e-5, rtol=0)
-    found = inputs.std(dim=0).mean()
-    expected = torch.ones(())
-    assert_close(found, expected)
+    assert_close(inputs.mean(dim=0), torch.zeros(24), atol=1e-5, rtol=0)
+    assert_close(inputs.std(dim=0).mean(), torch.ones(()))
     linear = head.layers[1]
     embedding = head(histograms)
-    expected = torch.nn.functional.normalize(linear(inputs), dim=1)
-    assert_close(embedding, expected)
+    assert_close(embedding, torch.nn.functional.normalize(linear(inputs), dim=1))
 
 
 def test_wrong_number_of_cells_is_named(histograms):
@@ -120,8 +112,7 @@ def test_the_head_alone_is_what_a_descriptor_under_it_deploys(histograms, make):
     vectors = head(histograms)
     expected = deployed.distances(vectors[:5], vectors)
     distance = BlendedDistance(head, share=1.0)
-    found = distance(histograms[:5], histograms)
-    assert_close(found, expected, atol=1e-6, rtol=1e-4)
+    assert_close(distance(histograms[:5], histograms), expected, atol=1e-6, rtol=1e-4)
     distance.calibrate(histograms)
     pairs = torch.triu_indices(12, 12, 1).unbind()
     unit = deployed.distances(vectors, vectors)[pairs].median()

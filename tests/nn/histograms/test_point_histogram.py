@@ -53,8 +53,7 @@ def test_it_is_the_share_of_samples_in_each_cell():
                 [0.25, 0.75, 1.25, 1.75],
             ),
         )
-        expected = memberships.mean(axis=0)
-        np.testing.assert_allclose(found[i].flatten(), expected, atol=1e-6)
+        np.testing.assert_allclose(found[i].flatten(), memberships.mean(axis=0), atol=1e-6)
 
 
 def test_a_subset_of_the_samples_is_counted():

@@ -90,9 +90,7 @@ def test_a_ball_has_its_own_radius_inside_and_none_outside(ball_radii):
         dim=1,
     )
     radii = ball_radii(0.3 * points, points)
-    found = radii[:, 0]
-    expected = torch.full((500,), 0.3)
-    assert_close(found, expected, rtol=1e-3, atol=0)
+    assert_close(radii[:, 0], torch.full((500,), 0.3), rtol=1e-3, atol=0)
     assert (radii[:, 1] == 10).all()
 
 
@@ -102,15 +100,11 @@ def test_two_plates_have_half_their_thickness_inside_and_half_their_gap_outside(
     points, directions = on(trimesh.util.concatenate(plates), 4000)
     inner = points[:, :2].abs().amax(dim=1) < 0.15
     radii = ball_radii(points, directions)
-    found = float(radii[inner, 0].median())
-    expected = pytest.approx(0.05, rel=0.1)
-    assert found == expected
+    assert float(radii[inner, 0].median()) == pytest.approx(0.05, rel=0.1)
     into_the_gap = inner & (
         ((points[:, 2] - 0.05).abs() < 1e-6) | ((points[:, 2] - 0.25).abs() < 1e-6)
     )
-    found = float(radii[into_the_gap, 1].median())
-    expected = pytest.approx(0.1, rel=0.1)
-    assert found == expected
+    assert float(radii[into_the_gap, 1].median()) == pytest.approx(0.1, rel=0.1)
 
 
 def test_two_points_inside_a_ball_do_not_change_the_other_radii(ball_radii):
@@ -122,16 +116,13 @@ def test_two_points_inside_a_ball_do_not_change_the_other_radii(ball_radii):
     directions = points.clone()
     points[:2] *= 0.5
     radii = ball_radii(points, directions)[2:, 0]
-    expected = torch.ones(398)
-    assert_close(radii, expected, rtol=1e-3, atol=0)
+    assert_close(radii, torch.ones(398), rtol=1e-3, atol=0)
 
 
 def test_three_samples_are_enough_and_two_are_not(ball_radii):
     points = torch.eye(3)
     outward = torch.tensor([0.0, 0.0, 1.0])
-    found = ball_radii(points, outward.expand(3, 3)).tolist()
-    expected = [[10.0, 10.0]] * 3
-    assert found == expected
+    assert ball_radii(points, outward.expand(3, 3)).tolist() == [[10.0, 10.0]] * 3
     with pytest.raises(
         ValueError, match="samples: expected at least 3 of each body for its balls, got 2"
     ):

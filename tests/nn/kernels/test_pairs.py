@@ -172,8 +172,7 @@ def test_histogram_is_the_sum_of_hats_over_all_pairs(device, layout, n_classes, 
     given = some(n_classes=n_classes)
     result = counted(layout, {name: value.to(device) for name, value in given.items()}).cpu()
     axes = [axis for kind in layout for axis in KINDS[kind][1](given)]
-    expected = pair_histogram_by_loops(given["memberships"], axes)
-    assert_allclose(result, expected, atol=1e-12)
+    assert_allclose(result, pair_histogram_by_loops(given["memberships"], axes), atol=1e-12)
     assert float(result.sum()) == pytest.approx(1, abs=1e-12)
     single = counted(
         layout,
@@ -197,8 +196,7 @@ def test_any_spacing_of_centres_is_exact(device, layout):
     pairs = euclidean_distances(given["coordinates"].to(device), bins)
     result = joint_histogram(given["memberships"].to(device), [pairs])
     axis = (distances(given["coordinates"]), layout)
-    expected = pair_histogram_by_loops(given["memberships"], [axis])
-    assert_allclose(result.cpu(), expected, atol=1e-12)
+    assert_allclose(result.cpu(), pair_histogram_by_loops(given["memberships"], [axis]), atol=1e-12)
 
 
 def test_single_precision_is_summed_in_double(device):
@@ -209,8 +207,7 @@ def test_single_precision_is_summed_in_double(device):
         {name: value.float() for name, value in given.items()},
     )
     assert float(result.sum()) == pytest.approx(1, abs=1e-6)
-    expected = counted(["many"], given).cpu()
-    assert_allclose(result.cpu(), expected, atol=1e-7)
+    assert_allclose(result.cpu(), counted(["many"], given).cpu(), atol=1e-7)
 
 
 @pytest.mark.parametrize("layout", [EQUAL, MANY])
@@ -276,8 +273,7 @@ def test_points_that_coincide_have_no_line(device):
     result = joint_histogram(
         points.new_ones(2, 1), [oriented_pairs(points, directions, angles, angles)]
     )
-    found = float(result[0, 1, 1].sum())
-    assert found == pytest.approx(1)
+    assert float(result[0, 1, 1].sum()) == pytest.approx(1)
 
 
 def test_a_reflection_turns_the_order_of_twists(device):
@@ -294,9 +290,7 @@ def test_a_reflection_turns_the_order_of_twists(device):
     }
     counts = counted(["equal", "twists"], given)
     assert float((counts - counts.flip(-1)).abs().max()) > 1e-3
-    found = counted(["equal", "twists"], mirrored)
-    expected = counts.flip(-1)
-    assert_close(found, expected)
+    assert_close(counted(["equal", "twists"], mirrored), counts.flip(-1))
 
 
 @pytest.mark.parametrize("joint", [False, True])
@@ -524,9 +518,7 @@ def test_coincident_points_have_finite_gradients(device):
     near, far = (grad(result[0, k], embedding, retain_graph=True)[0] for k in (0, 2))
     assert torch.isfinite(near).all()
     # 9 of the 15 pairs are at √0.75; pulling one point away along the diagonal stretches 3 of them by 1/√3 each axis.
-    found = far[3:].cpu()
-    expected = 3 / 15 / 0.7 / math.sqrt(3)
-    assert_allclose(found, expected, rtol=1e-9)
+    assert_allclose(far[3:].cpu(), 3 / 15 / 0.7 / math.sqrt(3), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
