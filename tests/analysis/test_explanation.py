@@ -224,21 +224,6 @@ def test_the_share_of_a_sample_is_the_derivative_by_its_weight(batches):
         )
 
 
-def test_a_bump_is_painted_where_it_is(signatures, batches):
-    found = explain(descriptor("rich"), *batches)
-    places = {kind: getattr(signatures[1], kind).points for kind in ("interior", "surface")}
-    points = places["surface"]
-    values = share_density(found.samples[1], places, points)
-    at_bump = (
-        norm(
-            points - points[points[:, 0].argmax()],
-            axis=1,
-        )
-        < 0.25
-    )
-    assert values[at_bump].mean() > 2 * abs(values[~at_bump].mean())
-
-
 @pytest.mark.parametrize("height", [0.08, -0.08])
 def test_a_small_bump_or_dent_is_painted_in_another_pose(height):
     """An egg, bent, with a bump that is a fiftieth of the root of its area high, or such a dent."""

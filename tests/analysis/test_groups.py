@@ -164,14 +164,16 @@ def test_statistics_are_those_of_the_textbook():
     within = 12 * (one.var(axis=0).sum() + other.var(axis=0).sum())
     assert test.permanova_f == pytest.approx(between / (within / 22))
     squares = squared_distances(vectors)
-    np.testing.assert_allclose(squares, ((vectors[:, None] - vectors) ** 2).sum(axis=2), atol=1e-12)
+    expected = ((vectors[:, None] - vectors) ** 2).sum(axis=2)
+    np.testing.assert_allclose(squares, expected, atol=1e-12)
     kernel = whitened_kernel(vectors)
     means = kernel[:12, :12].mean() + kernel[12:, 12:].mean() - 2 * kernel[:12, 12:].mean()
     assert test.kernel == pytest.approx(means)
     # Without bias: of the variance of all, the squared distance of the means less what chance adds to it
     variances = [part.var(axis=0, ddof=1).sum() for part in (one, other)]
     apart = ((one.mean(axis=0) - other.mean(axis=0)) ** 2).sum() - sum(variances) / 12
-    assert test.effect == pytest.approx(apart / 4 / (apart / 4 + sum(variances) / 2))
+    expected = pytest.approx(apart / 4 / (apart / 4 + sum(variances) / 2))
+    assert test.effect == expected
 
 
 def test_the_interval_covers_the_effect():
@@ -265,7 +267,8 @@ def test_a_probability_is_that_of_all_arrangements():
         ["a"] * 5 + ["b"] * 5,
         n_permutations=20_000,
     )
-    assert [test.permanova_p, test.kernel_p] == pytest.approx(exact, abs=0.01)
+    expected = pytest.approx(exact, abs=0.01)
+    assert [test.permanova_p, test.kernel_p] == expected
 
 
 @pytest.mark.parametrize(
@@ -304,7 +307,8 @@ def test_discovery_rates_are_over_what_was_tested():
     refused = GroupTest("no", {}, refused="too few")
     found = with_q_values([tests[0], refused, *tests[1:]])
     assert found[1] is refused
-    assert [one.permanova_q for one in found] == pytest.approx([0.03, None, 0.04, 0.04])
+    expected = pytest.approx([0.03, None, 0.04, 0.04])
+    assert [one.permanova_q for one in found] == expected
     assert with_q_values([refused]) == [refused]
     same = with_q_values([replace(one, body="all") for one in tests])
     assert [one.permanova_p for one in same] == [0.01, 0.04, 0.03]

@@ -177,7 +177,8 @@ def test_a_coarse_single_body_is_found_beside_a_class_of_finer_ones():
     labels = ["fine"] * 8 + [f"single {i}" for i in range(16)]
     spacing = np.log(np.repeat([1.0, 3.0], [8, 16]))
     spacing[20] = np.log(6)
-    assert outliers(squared_distances(usual()) ** 0.5, labels, {"spacing": spacing})[0].body == 20
+    found = outliers(squared_distances(usual()) ** 0.5, labels, {"spacing": spacing})[0].body
+    assert found == 20
 
 
 def test_a_repair_that_few_needed_is_a_reason():
@@ -213,7 +214,8 @@ def test_the_flat_share_is_that_of_the_flat_sides():
     box = trimesh.creation.box([1, 1, 2])
     for _ in range(4):
         box = box.subdivide()
-    assert flat_share(as_mesh(box)) == pytest.approx(2 / 10, abs=0.01)
+    expected = pytest.approx(2 / 10, abs=0.01)
+    assert flat_share(as_mesh(box)) == expected
     ball = trimesh.creation.icosphere(subdivisions=4)
     assert flat_share(as_mesh(ball)) < 0.03
 
@@ -227,11 +229,13 @@ def test_measures_are_those_of_the_meshes(tmp_path):
     dataset = SignatureDataset(paths, cache_dir=f"{tmp_path}/cache")
     measures = measure_bodies(dataset, n_workers=1)
     assert measures["handles"][0] == 1
-    assert measures["volume"][0] == pytest.approx(np.log(torus.volume))
+    expected = pytest.approx(np.log(torus.volume))
+    assert measures["volume"][0] == expected
     expected = pytest.approx(np.log(torus.area / len(torus.faces)) / 2)
     assert measures["spacing"][0] == expected
     for name in ("volume", "spacing"):
-        assert measures[name][2] == pytest.approx(measures[name][0], abs=1e-4)
+        expected = pytest.approx(measures[name][0], abs=1e-4)
+        assert measures[name][2] == expected
     assert not measures.pop("overlap").any()
     for values in measures.values():
         assert np.isnan(values[1])
@@ -246,7 +250,8 @@ def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path):
     files = [tmp_path / "fine.nii.gz", tmp_path / "coarse.nii.gz"]
     dataset = SignatureDataset(files, cache_dir=tmp_path)
     spacing = measure_bodies(dataset, n_workers=1)["spacing"]
-    assert np.exp(spacing) == pytest.approx([1, 2], rel=0.01)
+    expected = pytest.approx([1, 2], rel=0.01)
+    assert np.exp(spacing) == expected
 
 
 def test_labels_are_measured_in_their_grid(tmp_path):

@@ -254,7 +254,9 @@ def swept(solid):
 )
 def test_distance_to_swept_solids(solid):
     outside = swept(solid) > 0.0
-    np.testing.assert_allclose(solid.distance(*POINTS.T)[outside], swept(solid)[outside], atol=1e-3)
+    found = solid.distance(*POINTS.T)[outside]
+    expected = swept(solid)[outside]
+    np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
 @pytest.mark.parametrize(
