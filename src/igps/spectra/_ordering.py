@@ -96,9 +96,7 @@ class _Scratch(NamedTuple):
     """Arrays that every part uses again.
 
     Args:
-        rank: (V,) position of each vertex in the order of the part, or -1 outside the part, which is the largest
-            unsigned number. The highest (signed) and the lowest (unsigned) rank among neighbours are therefore found
-            without checking whether these are in the part.
+        rank: (V,) position of each vertex in the order of the part, or −1 outside the part.
         low: (V,) lowest rank among a vertex and its neighbours, by the vertex's rank.
         high: (V,) highest such rank.
         n_lowest: (V + 1,) number of vertices whose lowest rank is one less than the index.
@@ -177,7 +175,7 @@ def _dissect(
             node[orders[0, i]] = (1 << depth) - 1 + part
 
 
-@compiled()
+@compiled(inline="always")
 def _rank_neighbours(
     order: np.ndarray, indptr: np.ndarray, indices: np.ndarray, scratch: _Scratch
 ) -> None:
@@ -189,21 +187,23 @@ def _rank_neighbours(
         scratch.n_highest[i] = 0
         scratch.n_lowest[i] = 0
     for i in range(size):
-        lowest = np.uint32(i)
-        highest = np.int32(i)
-        for k in range(np.uint64(indptr[order[i]]), np.uint64(indptr[order[i] + 1])):
-            neighbour_rank = scratch.rank[np.uint32(indices[k])]
-            lowest = min(lowest, np.uint32(neighbour_rank))
-            highest = max(highest, neighbour_rank)
+        lowest = highest = i
+        for k in range(indptr[order[i]], indptr[order[i] + 1]):
+            neighbour_rank = scratch.rank[indices[k]]
+            if neighbour_rank > highest:
+                highest = neighbour_rank
+            elif 0 <= neighbour_rank < lowest:
+                lowest = neighbour_rank
         scratch.low[i] = lowest
         scratch.high[i] = highest
         scratch.n_highest[highest + 1] += 1
         scratch.n_lowest[lowest + 1] += 1
 
 
-@compiled()
+@compiled(inline="always")
 def _smallest_cut(scratch: _Scratch, size: int, n_vertices: int, window: float) -> _Cut:
     """Return the cut with the smallest separator in a window around the median of a part."""
+    half_window = window * size if window * size > 1.0 else 1.0
     at = 0
     cut_size = n_vertices
     is_left = True
@@ -213,18 +213,19 @@ def _smallest_cut(scratch: _Scratch, size: int, n_vertices: int, window: float) 
     for i in range(size):
         n_closed += scratch.n_highest[i]
         n_opened += scratch.n_lowest[i]
-        if i == 0 or abs(i - size / 2) > max(window * size, 1.0):
+        if i == 0 or abs(i - size / 2) > half_window:
             continue
         left_size = i - n_closed
         right_size = n_opened - i
-        if min(left_size, right_size) < cut_size:
+        smaller_size = left_size if left_size <= right_size else right_size
+        if smaller_size < cut_size:
             at = i
-            cut_size = min(left_size, right_size)
+            cut_size = smaller_size
             is_left = left_size <= right_size
     return _Cut(at, cut_size, is_left)
 
 
-@compiled()
+@compiled(inline="always")
 def _mark_sides(order: np.ndarray, cut: _Cut, scratch: _Scratch) -> None:
     """Write the side of each vertex of a part."""
     for i in range(len(order)):
@@ -234,7 +235,7 @@ def _mark_sides(order: np.ndarray, cut: _Cut, scratch: _Scratch) -> None:
             scratch.side[order[i]] = 2 if not cut.is_left and scratch.low[i] < cut.at else 1
 
 
-@compiled()
+@compiled(inline="always")
 def _separate(order: np.ndarray, scratch: _Scratch) -> tuple[int, int]:
     """Move the vertices of the left side to the front and those of the right side behind them; return their numbers."""
     n_left = 0

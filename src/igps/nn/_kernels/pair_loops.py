@@ -64,7 +64,7 @@ def new_row(axes: Axes, n_columns: int) -> Row:
     )
 
 
-@compiled()
+@compiled(inline="always")
 def whole_vectors(first: int, n_columns: int) -> int:
     """Return the column to start at, ``first`` or less, so that loops process whole vectors: a remainder is slower."""
     return max(0, n_columns - (n_columns - first + _MAX_VECTOR - 1) // _MAX_VECTOR * _MAX_VECTOR)
@@ -400,8 +400,10 @@ def count_block(
         shares = result.shares
         if n_members > 1:
             for j in range(len(cell)):
-                lowest = min(lowest, cell[j])
-                highest = max(highest, cell[j])
+                if cell[j] < lowest:
+                    lowest = cell[j]
+                if cell[j] > highest:
+                    highest = cell[j]
         for m in range(n_members):
             home_m = home[m, first:]
             weight = weights[m, column + first :]
