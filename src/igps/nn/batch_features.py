@@ -5,8 +5,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from igps.data.batch import SampleBatch, SignatureBatch
-from igps.nn._kernels.balls import ball_radii
 from igps.nn._kernels.batches import map_bodies
+from igps.nn._kernels.neighbours import ball_radii, smallest
 from igps.nn._precision import full_precision
 from igps.nn.embedding import barycentroid_potential
 from igps.signature.signature import SampleKind
@@ -136,7 +136,7 @@ def nearest_directions(
     with full_precision():
         real = targets.detach().masked_fill(~mask.unsqueeze(-1), _FAR_AWAY)
         distances = torch.cdist(points.detach(), real)
-    nearest, indices = distances.topk(min(n_nearest, mask.shape[-1]), largest=False)
+    nearest, indices = smallest(distances, min(n_nearest, mask.shape[-1]))
     is_real = (nearest < _FAR_AWAY).unsqueeze(-1)
     rows = indices.flatten(-2).unsqueeze(-1).expand(*indices.shape[:-2], -1, points.shape[-1])
     neighbours = targets.gather(-2, rows).unflatten(-2, indices.shape[-2:])
@@ -161,7 +161,7 @@ def nearest_neighbours(
     squares.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
     if mask is not None:
         squares.masked_fill_(~mask.unsqueeze(-2), torch.inf)
-    nearest, indices = squares.topk(min(n_nearest, n_points - 1), largest=False)
+    nearest, indices = smallest(squares, min(n_nearest, n_points - 1))
     return torch.where(
         nearest < torch.inf, indices, torch.arange(n_points, device=points.device)[:, None]
     )

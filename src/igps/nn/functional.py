@@ -1,6 +1,6 @@
 """The mathematics of the modules as functions of tensors, without parameters or state."""
 
-from igps.nn._kernels.balls import ball_radii
+from igps.nn._kernels.neighbours import ball_radii
 from igps.nn._kernels.pairs_by_torch import (
     euclidean_distances,
     oriented_pairs,
