@@ -18,7 +18,8 @@ def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[s
     from igps.cli.retrieval_commands import retrieve
     from igps.shapes import ArticulatedShapes
 
-    shapes = ArticulatedShapes(n_classes=8, n_per_class=10)
+    # Fewer vertices than a page shows, so that the loops that simplify surfaces are not compiled for the demo
+    shapes = ArticulatedShapes(n_classes=8, n_per_class=10, n_vertices=850)
     shapes.write(out / "shapes", progress=True)
     options: dict[str, Any] = {"out": out, "cache_dir": out / "cache", "n_workers": n_workers}
     summary = retrieve(out / "shapes", **options)
