@@ -59,10 +59,11 @@ def rigid_motion(body: Mesh, target: Mesh, *, scale: float = 1.0) -> Motion:
     coarse = points[:: _N_FINE // _N_COARSE]
     candidates = []
     for turn in starts:
-        start = Motion(turn, scale, goal - scale * turn @ centre)
-        candidates.append(
-            start if len(starts) == 1 else _fitted(start, coarse, aim, _N_COARSE_STEPS)
-        )
+        shift = goal - scale * turn @ centre
+        start = Motion(turn, scale, shift)
+        if len(starts) > 1:
+            start = _fitted(start, coarse, aim, _N_COARSE_STEPS)
+        candidates.append(start)
     best = min(candidates, key=lambda motion: _misfit(motion, coarse, aim))
     return _fitted(best, points, aim, _N_FINE_STEPS)
 
@@ -72,10 +73,12 @@ def _spread(mesh: Mesh, n: int) -> tuple[Floats, Floats]:
     random = np.random.default_rng(0)
     vectors = area_vectors(mesh.vertices, mesh.faces)
     ends = np.linalg.norm(vectors, axis=1).cumsum()
-    chosen = np.searchsorted(ends, (np.arange(n) + random.random(n)) / n * ends[-1])
+    shares = (np.arange(n) + random.random(n)) / n
+    chosen = np.searchsorted(ends, shares * ends[-1])
     chosen = random.permutation(np.minimum(chosen, len(ends) - 1))
-    corners = random.dirichlet(np.ones(3), n)
-    points = np.einsum("nk,nkc->nc", corners, mesh.vertices[mesh.faces[chosen]])
+    weights = random.dirichlet(np.ones(3), n)
+    corners = mesh.vertices[mesh.faces[chosen]]
+    points = np.einsum("nk,nkc->nc", weights, corners)
     return points, unit(vectors[chosen])
 
 
@@ -86,7 +89,8 @@ def _turns(points: Floats, target: Floats) -> list[Floats]:
     turns = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
-            turn = others.T @ (np.eye(3)[list(order)] * signs) @ own
+            axes = np.eye(3)[list(order)] * signs
+            turn = others.T @ axes @ own
             if np.linalg.det(turn) > 0:
                 turns.append(turn)
     return turns
@@ -97,16 +101,19 @@ def _fitted(motion: Motion, points: Floats, target: _Target, n_steps: int) -> Mo
         moved = motion.of(points)
         _, nearest = target.tree.query(moved)
         normals = target.normals[nearest]
-        gaps = ((target.points[nearest] - moved) * normals).sum(axis=1)
+        steps = target.points[nearest] - moved
+        gaps = (steps * normals).sum(axis=1)
         gaps -= np.median(gaps)  # a body that is larger all around stays where it is
-        kept = np.argsort(np.abs(gaps))[: int(_KEPT * len(points))]
+        n_kept = int(_KEPT * len(points))
+        kept = np.argsort(np.abs(gaps))[:n_kept]
         normals = normals[kept]
         gaps = gaps[kept]
         centre = moved.mean(axis=0)
         size = np.linalg.norm(moved - centre, axis=1).mean()
-        arms = np.cross((moved[kept] - centre) / size, normals)
+        arms = (moved[kept] - centre) / size
+        columns = np.hstack([np.cross(arms, normals), normals])
         # Bodies of revolution leave a turn free: the smallest solution does not turn them
-        solution = np.linalg.lstsq(np.hstack([arms, normals]), gaps, rcond=1e-3)[0]
+        solution = np.linalg.lstsq(columns, gaps, rcond=1e-3)[0]
         angles = solution[:3] / size
         turn = Rotation.from_rotvec(angles).as_matrix()
         shift = turn @ (motion.shift - centre) + centre + solution[3:]
@@ -119,5 +126,6 @@ def _fitted(motion: Motion, points: Floats, target: _Target, n_steps: int) -> Mo
 def _misfit(motion: Motion, points: Floats, target: _Target) -> float:
     """Return the mean distance of the points that count from the target."""
     distances, _ = target.tree.query(motion.of(points))
-    kept = np.sort(distances)[: int(_KEPT * len(points))]
+    n_kept = int(_KEPT * len(points))
+    kept = np.sort(distances)[:n_kept]
     return float(kept.mean())

@@ -50,31 +50,38 @@ def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
     Returns:
         (P,) the exponential of the sum of both, positive.
     """
-    nearest = _nearest(_heat_kernels(body, _LARGE_TIMES), _heat_kernels(other, _LARGE_TIMES))
-    points = _points(body.surface, body)
+    places = _heat_kernels(body, _LARGE_TIMES)
+    other_places = _heat_kernels(other, _LARGE_TIMES)
+    nearest = _nearest(places, other_places)
     by_shape = squared_deviations(local_shape(body), local_shape(other), nearest)
     small = _heat_kernels(body, _SMALL_TIMES)
     other_small = _heat_kernels(other, _SMALL_TIMES)
     by_heat = squared_deviations(small, other_small, nearest)
-    return np.exp(_standardised(by_shape, points) + _standardised(by_heat, points))
+    points = _points(body.surface, body)
+    shape = _standardised(by_shape, points)
+    heat = _standardised(by_heat, points)
+    return np.exp(shape + heat)
 
 
 def _standardised(deviations: Floats, points: Floats) -> Floats:
     """Return the logarithms of squared deviations, smoothed on the surface, with mean 0 and scatter 1."""
     smoothed = _smoothed(np.log1p(deviations), points)
-    return (smoothed - smoothed.mean()) / (smoothed.std() + 1e-12)
+    scatter = smoothed.std() + 1e-12
+    return (smoothed - smoothed.mean()) / scatter
 
 
 def _points(samples: SampleBatch, body: SignatureBatch) -> Floats:
     """Return the positions of samples (P, 3), over √area."""
     points = samples.points[0][samples.mask[0]]
-    return points.double().numpy() / float(body.area[0]) ** 0.5
+    size = float(body.area[0]) ** 0.5
+    return points.double().numpy() / size
 
 
 def _heat_kernels(body: SignatureBatch, times: Floats) -> Floats:
     """Return log(heat kernel · area) at each surface sample, (P, times)."""
     area = float(body.area[0])
-    eigenfunctions = body.surface.eigenfunctions[0][body.surface.mask[0]]
+    is_sample = body.surface.mask[0]
+    eigenfunctions = body.surface.eigenfunctions[0][is_sample]
     squares = eigenfunctions.double().square().numpy() * area
     values = body.eigenvalues[0].double().numpy() * area
     decay = np.exp(-np.outer(values, times))
@@ -85,7 +92,8 @@ def _nearest(one: Floats, other: Floats) -> Integers:
     """Return indices (P, n) of the nearest rows of the other array, each column standardised by it."""
     scale = other.std(axis=0) + 1e-9
     tree = cKDTree(other / scale)
-    _, nearest = tree.query(one / scale, _ranks(_N_CORRESPONDING, len(other)))
+    ranks = _ranks(_N_CORRESPONDING, len(other))
+    _, nearest = tree.query(one / scale, ranks)
     return nearest
 
 
@@ -109,8 +117,11 @@ def squared_deviations(own: Floats, others: Floats, nearest: Integers) -> Floats
     offsets = corresponding - means[:, None]
     steps = (own - means)[:, :, None]
     overall = np.cov(others.T, bias=True)
-    least = np.square(_MIN_DEVIATION) * overall + 1e-12 * np.eye(others.shape[1])
-    covariances = offsets.transpose(0, 2, 1) @ offsets / nearest.shape[1] + least
+    n_measures = others.shape[1]
+    least = np.square(_MIN_DEVIATION) * overall + 1e-12 * np.eye(n_measures)
+    n_corresponding = nearest.shape[1]
+    covariances = offsets.transpose(0, 2, 1) @ offsets / n_corresponding
+    covariances = covariances + least
     solved = np.linalg.solve(covariances, steps)
     return (steps * solved).sum(axis=(1, 2))
 
@@ -122,10 +133,12 @@ def local_shape(body: SignatureBatch) -> Floats:
     the normals of the patch (least squares). The body meets `REQUIREMENTS`.
     """
     points = _points(body.surface, body)
-    directions = body.surface.attributes["surface_direction"]
-    normals = unit(directions[0][body.surface.mask[0]].double().numpy())
+    is_sample = body.surface.mask[0]
+    directions = body.surface.attributes["surface_direction"][0]
+    normals = unit(directions[is_sample].double().numpy())
     slopes = _slopes_of_normals(points, normals)
-    curvatures = np.linalg.eigvalsh((slopes + slopes.transpose(0, 2, 1)) / 2)
+    symmetric = (slopes + slopes.transpose(0, 2, 1)) / 2
+    curvatures = np.linalg.eigvalsh(symmetric)
     radii = _inner_balls(points, normals)
     return np.column_stack([curvatures, np.log(radii)])
 
@@ -146,17 +159,21 @@ def _slopes_of_normals(points: Floats, normals: Floats) -> Floats:
     """
     axes = _tangents(normals)
     # A disc of this radius has a share π r² of all samples; the curved surface, and another one near it, have more
-    n_patch = max(_MIN_PATCH, math.ceil(1.5 * math.pi * _PATCH**2 * len(points)))
-    distances, patch = cKDTree(points).query(points, _ranks(n_patch, len(points)))
+    n_expected = 1.5 * math.pi * _PATCH**2 * len(points)
+    n_patch = max(_MIN_PATCH, math.ceil(n_expected))
+    ranks = _ranks(n_patch, len(points))
+    distances, patch = cKDTree(points).query(points, ranks)
     weights = np.clip(1 - np.square(distances / _PATCH), 0, 1)
     cosines = np.einsum("pkc,pc->pk", normals[patch], normals)
     weights *= cosines > _MIN_COSINE
-    steps = (points[patch] - points[:, None]) @ axes / _PATCH
+    offsets = points[patch] - points[:, None]
+    steps = offsets @ axes / _PATCH
     ones = np.ones_like(steps[:, :, :1])
     terms = np.concatenate([ones, steps], axis=2)
     weighted = (terms * weights[:, :, None]).transpose(0, 2, 1)
     matrix = weighted @ terms + 1e-3 * np.eye(3)  # solvable if all weights but one are 0
-    fits = np.linalg.solve(matrix, weighted @ (normals[patch] @ axes))
+    tilts = normals[patch] @ axes
+    fits = np.linalg.solve(matrix, weighted @ tilts)
     return fits[:, 1:]
 
 
@@ -171,8 +188,11 @@ def _inner_balls(points: Floats, normals: Floats) -> Floats:
         own = points[rows]
         inward = normals[rows]
         squares = cdist(own, points, "sqeuclidean")
-        depths = (inward * own).sum(axis=1, keepdims=True) - inward @ points.T
-        counts = (squares > _NEAR**2) & (depths > _MIN_SINE * np.sqrt(squares))
+        own_heights = (inward * own).sum(axis=1, keepdims=True)
+        depths = own_heights - inward @ points.T
+        is_away = squares > _NEAR**2
+        is_below = depths > _MIN_SINE * np.sqrt(squares)
+        counts = is_away & is_below
         diameters = np.where(counts, 2 * depths, 1)
         # Radius of the ball that touches here and runs through each other point
         through = np.where(counts, squares / diameters, _MAX_BALL)

@@ -24,8 +24,9 @@ _MAX_VOXELS = 1 << 20
 def stray_root(mask: Booleans) -> float:
     """Return the root of the share of voxels that no face, edge or corner connects to the largest piece."""
     pieces, _ = ndimage.label(mask, np.ones((3, 3, 3)))
-    largest = np.bincount(pieces[mask]).max()
-    return float(np.sqrt(1 - largest / np.count_nonzero(mask)))
+    sizes = np.bincount(pieces[mask])
+    share = sizes.max() / np.count_nonzero(mask)
+    return float(np.sqrt(1 - share))
 
 
 def cavity_root(mask: Booleans) -> float:
@@ -54,7 +55,8 @@ def hole_root(mask: Booleans) -> float:
 
 def _root_of_share(defect: Booleans, mask: Booleans) -> float:
     """Return the root of the number of voxels of a defect, over that of the body."""
-    return float(np.sqrt(np.count_nonzero(defect) / np.count_nonzero(mask)))
+    n_voxels = np.count_nonzero(mask)
+    return float(np.sqrt(np.count_nonzero(defect) / n_voxels))
 
 
 def gap_root(mask: Booleans, sides: Floats) -> float:
@@ -67,12 +69,13 @@ def gap_root(mask: Booleans, sides: Floats) -> float:
         mask = _halved(mask)
         sides = 2 * sides
     depths = ndimage.distance_transform_edt(np.pad(mask, 1), sides)
-    depth = depths.max()
-    radius = max(_CLOSING_RADIUS * depth, 1.01 * sides.min())
+    radius = max(_CLOSING_RADIUS * depths.max(), 1.01 * sides.min())
     margins = [int(radius / side) + 2 for side in sides]
     padded = np.pad(mask, [(margin, margin) for margin in margins])
-    dilated = ndimage.distance_transform_edt(~padded, sides) <= radius
-    outside = ndimage.distance_transform_edt(dilated, sides) <= radius
+    away = ndimage.distance_transform_edt(~padded, sides)
+    dilated = away <= radius
+    back = ndimage.distance_transform_edt(dilated, sides)
+    outside = back <= radius
     return _root_of_share(~outside & ~padded, mask)
 
 
@@ -140,7 +143,8 @@ def overlaps(places: Sequence[Place | None], labels: Sequence[str] | None = None
             low = np.maximum(a.low, b.low)
             high = np.minimum(a.low + a.shape, b.low + b.shape)
             if (low < high).all():
-                n_shared = np.count_nonzero(a.mask(low, high) & b.mask(low, high))
+                is_shared = a.mask(low, high) & b.mask(low, high)
+                n_shared = np.count_nonzero(is_shared)
                 shares[i, j] = n_shared / a.n_voxels
                 shares[j, i] = n_shared / b.n_voxels
     return shares
