@@ -266,13 +266,12 @@ def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path):
     assert molecule.residue_names == ("ALA", "QQQ")
 
 
-def test_hydrogens_are_left_out_unless_asked_for(tmp_path):
+def test_hydrogens_are_left_out(tmp_path):
     path = written(
         tmp_path,
         residue(1, atoms=[*ALANINE, ("H", 0.0, -1.0)]),
     )
     assert len(read_molecule(path)[0].radii) == 5
-    assert len(read_molecule(path, hydrogens=True)[0].radii) == 6
 
 
 def test_a_backbone_gets_balls_of_its_side_chains(tmp_path):

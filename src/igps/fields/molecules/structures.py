@@ -72,14 +72,13 @@ def read_molecule(
     bodies: MoleculeBodies = "chains",
     *,
     ligands: bool = False,
-    hydrogens: bool = False,
 ) -> list[Molecule]:
     """Read the bodies of a structure file: PDB, mmCIF, BinaryCIF or PQR, gzipped or not.
 
-    Each model of an ensemble, and each data block of mmCIF with atoms, yields separate bodies. Water is left out. The
-    alternative location with the highest occupancy is used, the first one of a tie. Radii are van der Waals radii of
-    the elements (Bondi 1964), and charges those of residues at pH 7, without the ends of chains. Radii, charges and
-    hydrogens of a PQR file are used as they are.
+    Each model of an ensemble, and each data block of mmCIF with atoms, yields separate bodies. Water and hydrogens are
+    left out. The alternative location with the highest occupancy is used, the first one of a tie. Radii are van der
+    Waals radii of the elements (Bondi 1964), and charges those of residues at pH 7, without the ends of chains. Radii,
+    charges and hydrogens of a PQR file are used as they are.
 
     Backbones and Cα traces can be read, too (volumes of Zamyatnin 1972): for atoms that a side chain lacks, a ball with
     their share of its volume and their charge touches the last atom that is there, in the direction of the side chain.
@@ -98,7 +97,6 @@ def read_molecule(
         bodies: "chains", "models", or "assembly" for the first biological assembly of the file, made from each model.
             Bodies without usable atoms are left out with a warning in the log.
         ligands: keep residues that belong to no polymer. They are always kept if the file has no polymers.
-        hydrogens: keep hydrogens, which most structures lack.
 
     Raises:
         ValueError: unknown `bodies`.
@@ -109,9 +107,9 @@ def read_molecule(
     check_one_of(get_args(MoleculeBodies), bodies=bodies)
     parts = list(parts_of(read_structures(path), bodies, path))
     is_pqr = suffix_of(path) == ".pqr"
-    molecules, left_out = _molecules(parts, ligands, hydrogens, is_pqr)
+    molecules, left_out = _molecules(parts, ligands, is_pqr)
     if not molecules and not ligands:
-        molecules, left_out = _molecules(parts, True, hydrogens, is_pqr)
+        molecules, left_out = _molecules(parts, True, is_pqr)
     if not molecules:
         fault = f"{path}: no atoms of a molecule with positions, in {len(parts)} {bodies}."
         raise MeshError(f"{fault} Check that the file is complete, and not of water alone.")
@@ -126,14 +124,13 @@ def read_molecule(
 def _molecules(
     parts: list[tuple[str, list[gemmi.Chain], list[str]]],
     ligands: bool,
-    hydrogens: bool,
     is_pqr: bool,
 ) -> tuple[list[Molecule], list[str]]:
     """Build the molecules of parts; return also the names of parts without usable atoms."""
     molecules = []
     left_out = []
     for name, chains, notes in parts:
-        builder = _Builder(ligands, hydrogens or is_pqr, is_pqr)
+        builder = _Builder(ligands, is_pqr)
         for chain in chains:
             builder.add_chain(chain)
         if any(radius > 0 for _, radius, _, _ in builder.balls):
@@ -144,9 +141,8 @@ def _molecules(
 
 
 class _Builder:
-    def __init__(self, ligands: bool, hydrogens: bool, is_pqr: bool) -> None:
+    def __init__(self, ligands: bool, is_pqr: bool) -> None:
         self.ligands = ligands
-        self.hydrogens = hydrogens
         self.is_pqr = is_pqr
         self.balls: list[tuple[Floats, float, float, int]] = []  # position, radius, charge, residue
         # Name, position, B-factor, number (NaN outside polymers), chain and label
@@ -300,7 +296,7 @@ class _Builder:
             # If names begin in the wrong column, gemmi takes Cα for calcium
             if is_standard and atom.element.name not in _STANDARD_ELEMENTS:
                 atom.element = gemmi.Element("X")
-            if not self.hydrogens and _is_hydrogen(atom):
+            if not self.is_pqr and _is_hydrogen(atom):
                 continue
             if not math.isfinite(atom.pos.length()):
                 self._count["nowhere"] += 1
