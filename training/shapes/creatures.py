@@ -118,10 +118,10 @@ def beast(g: np.random.Generator, pairs: int, stance: str, head: str, tail: str)
         for s in (-1, 1):
             if stands:
                 place = (0.62 * s * room, y, -0.4 * room)
-                heading = (0.2 * s, 0.0, -1.0)
+                heading = (0.2 * s, 0, -1)
             else:
                 place = (0.6 * s * room, y, 0)
-                heading = (float(s), 0.5 * y / half, 0.25)
+                heading = (s, 0.5 * y / half, 0.25)
             parts.append(leg.joined(place, heading))
     long = head == "long"
     reach = g.uniform(0.7, 0.9) if long else g.uniform(0.2, 0.35)
