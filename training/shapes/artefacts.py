@@ -14,6 +14,9 @@ from training.shapes.limbs import LimbStyle, ending
 from training.shapes.polygons import Frame, Prism
 from training.shapes.ring import Ring
 
+# Shares of the height at which the handles of a vessel end
+_HANDLE_ENDS = {"bowl": (0.08, 0.93), "vase": (0.42, 0.98), "bottle": (0.35, 0.93)}
+
 
 def vessel(g: np.random.Generator, body: str, handles: int, foot: str, extra: str) -> Skeleton:
     """Build a hollow body of revolution with handles, a foot, and a spout or knobs."""
@@ -22,24 +25,26 @@ def vessel(g: np.random.Generator, body: str, handles: int, foot: str, extra: st
     wall = g.uniform(0.17, 0.21)
     profile = [(float(r), float(z)) for r, z in _profile(g, body, wide, high)]
     radii, heights = np.array(profile).T
-    rising = slice(1, None) if radii[0] == 0.0 and heights[1] == 0.0 else slice(0, None)
+    has_flat_bottom = radii[0] == 0.0 and heights[1] == 0.0
+    rising = slice(1 if has_flat_bottom else 0, None)
 
     def wall_at(share: float) -> tuple[float, float]:
         z = share * heights[-1]
         return float(np.interp(z, heights[rising], radii[rising])), float(z)
 
     # Handles span a straight or concave part of the wall, because a bulge would fill their opening.
-    ends = {"bowl": (0.08, 0.93), "vase": (0.42, 0.98), "bottle": (0.35, 0.93)}.get(
-        body, (0.18, 0.85)
-    )
-    (r0, z0), (r1, z1) = (wall_at(share) for share in ends)
+    lower, upper = _HANDLE_ENDS.get(body, (0.18, 0.85))
+    r0, z0 = wall_at(lower)
+    r1, z1 = wall_at(upper)
     rise = z1 - z0
-    ear = Part(
-        Arc(0.5 * float(np.hypot(r1 - r0, rise)), np.pi, 0.1, 0.1), "handle", (0, 5, 0), blend=0.04
-    )
-    parts = [
-        ear.joined((r0 * c, r0 * s, z0), (c * rise, s * rise, r0 - r1)) for c, s in circle(handles)
-    ]
+    span = float(np.hypot(r1 - r0, rise))
+    arc = Arc(0.5 * span, np.pi, 0.1, 0.1)
+    ear = Part(arc, "handle", (0, 5, 0), blend=0.04)
+    parts = []
+    for c, s in circle(handles):
+        place = (r0 * c, r0 * s, z0)
+        heading = (c * rise, s * rise, r0 - r1)
+        parts.append(ear.joined(place, heading))
     match extra:
         case "spout":
             r, z = wall_at(0.4)
@@ -48,21 +53,23 @@ def vessel(g: np.random.Generator, body: str, handles: int, foot: str, extra: st
         case "knobs":
             r, z = wall_at(0.5)
             knob = Part(Blob((0.16, 0.16, 0.16)), "knob", lift=0.08)
-            parts += [knob.joined((r * c, r * s, z), (c, s, 0)) for c, s in circle(5, 0.6)]
+            for c, s in circle(5, 0.6):
+                parts.append(knob.joined((r * c, r * s, z), (c, s, 0)))
     match foot:
         case "legs":
             bottom = float(radii[0])
             reach = max(bottom, 0.3)
             z = 0.0 if bottom else float(np.interp(reach, radii[:3], heights[:3]))
             leg = limb("leg", [0.5], [0.12, 0.1], [(9, 9)])
-            parts += [
-                leg.joined((reach * c, reach * s, z), (0.4 * c, 0.4 * s, -1))
-                for c, s in circle(3, 0.3)
-            ]
+            for c, s in circle(3, 0.3):
+                place = (reach * c, reach * s, z)
+                parts.append(leg.joined(place, (0.4 * c, 0.4 * s, -1)))
         case "stem":
             plate = Part(Prism(24, 0.42, 0.18, 0.07), "foot", at=(0, 0, 0.5))
-            parts.append(limb("stem", [0.5], [0.13, 0.12], [(4, 4)], [plate]).joined(ORIGIN, DOWN))
-    return Skeleton(Part(Shell(tuple(profile), wall), blend=0.05, children=tuple(parts)), handles)
+            stem = limb("stem", [0.5], [0.13, 0.12], [(4, 4)], [plate])
+            parts.append(stem.joined(ORIGIN, DOWN))
+    shell = Shell(tuple(profile), wall)
+    return Skeleton(Part(shell, blend=0.05, children=tuple(parts)), handles)
 
 
 def _profile(
@@ -72,7 +79,8 @@ def _profile(
     match body:
         case "bowl":
             sweep = np.linspace(0.0, g.uniform(1.4, 1.9), 9)
-            return [(1.6 * wide * np.sin(a), 1.6 * wide * (1.0 - np.cos(a))) for a in sweep]
+            radius = 1.6 * wide
+            return [(radius * np.sin(a), radius * (1.0 - np.cos(a))) for a in sweep]
         case "vase":
             waist = g.uniform(0.4, 0.6) * wide + 0.08
             belly = (1.2 * wide, 0.4 * high)
@@ -94,24 +102,31 @@ def _profile(
 def wheel(g: np.random.Generator, n: int, spokes: int, limbs: str, end: str) -> Skeleton:
     """Build a rigid frame with spokes inside and limbs at its corners."""
     radius = g.uniform(0.75, 0.95) * (1.0 + 0.07 * spokes)
-    style = LimbStyle.draw(g, "jointed" if limbs == "rays" else "straight", end, 0.6, 0.11)
+    kind = "jointed" if limbs == "rays" else "straight"
+    style = LimbStyle.draw(g, kind, end, 0.6, 0.11)
     corners = circle(n)
     spoke = limb("body", [radius], [0.1, 0.1], [(0, 0)])
-    parts = [spoke.joined(ORIGIN, (*corners[i * n // spokes], 0)) for i in range(spokes)]
+    parts = []
+    for i in range(spokes):
+        c, s = corners[i * n // spokes]
+        parts.append(spoke.joined(ORIGIN, (c, s, 0)))
     if spokes:
         parts.append(Part(Blob((0.2, 0.2, 0.15)), "hub"))
     arm = style.grow()
     match limbs:
         case "rays":
-            parts += [arm.joined((radius * c, radius * s, 0), (c, s, 0.3)) for c, s in corners]
+            for c, s in corners:
+                parts.append(arm.joined((radius * c, radius * s, 0), (c, s, 0.3)))
         case "legs":
-            parts += [
-                arm.joined((radius * c, radius * s, 0), (0.2 * c, 0.2 * s, -1)) for c, s in corners
-            ]
+            for c, s in corners:
+                heading = (0.2 * c, 0.2 * s, -1)
+                parts.append(arm.joined((radius * c, radius * s, 0), heading))
         case "mast":
             mast = replace(style, length=1.5 * style.length).grow()
             parts.append(mast.joined((radius, 0, 0), (1, 0, 0)))
-    return Skeleton(Part(Frame(n, radius, 0.12), children=tuple(parts)), max(spokes - 1, 0))
+    frame = Frame(n, radius, 0.12)
+    n_loops = max(spokes - 1, 0)
+    return Skeleton(Part(frame, children=tuple(parts)), n_loops)
 
 
 def table(g: np.random.Generator, top: str, legs: int, back: str) -> Skeleton:
@@ -151,63 +166,90 @@ def table(g: np.random.Generator, top: str, legs: int, back: str) -> Skeleton:
     if legs == 1:
         plate = Part(Prism(24, 0.8 * wide, 0.2, 0.08), "foot", (4, 4, 0), (0, 0, high))
         stem = limb("stem", [high], [0.15, 0.15], [(4, 4)], [plate])
-        parts = [stem.joined((reach if hoop else 0.0, 0, 0), DOWN)]
+        aside = reach if hoop else 0.0
+        parts = [stem.joined((aside, 0, 0), DOWN)]
     else:
         corners = circle(legs, np.pi / 4 if long else 0.0)
         stretch = 1.9 if long else 1.0
-        parts = [
-            leg.joined((reach * c, stretch * reach * s, 0), (splay * c, splay * s, -1))
-            for c, s in corners
-        ]
+        parts = []
+        for c, s in corners:
+            corner = (reach * c, stretch * reach * s, 0)
+            parts.append(leg.joined(corner, (splay * c, splay * s, -1)))
+    parts += _back(back, wide, rear, hoop)
+    return Skeleton(Part(solid, children=tuple(parts)))
+
+
+def _back(kind: str, wide: float, rear: float, hoop: bool) -> list[Part]:
+    """The back of a table of some width, at a distance behind its centre; none of an unknown kind."""
     place = (0, rear, 0)
-    match back:
+    bend = (12, 0, 0)
+    match kind:
         case "panel":
-            parts.append(
-                Part(Box((1.2 * wide, 0.18, 0.9), 0.07), "back", (12, 0, 0), place, lift=0.42)
-            )
+            panel = Box((1.2 * wide, 0.18, 0.9), 0.07)
+            return [Part(panel, "back", bend, place, lift=0.42)]
         case "arch":
-            parts.append(
-                Part(Ring(0.6 * wide, 0.11, 0.15), "back", (12, 0, 0), place, lift=0.6 * wide + 0.2)
-            )
+            arch = Ring(0.6 * wide, 0.11, 0.15)
+            lift = 0.6 * wide + 0.2
+            return [Part(arch, "back", bend, place, lift=lift)]
         case "post":
             knob = ending("knob", 0.1, "back", (0, 0, 0.8))
-            parts.append(limb("back", [0.8], [0.12, 0.11], [(12, 12)], knob).joined(place))
+            post = limb("back", [0.8], [0.12, 0.11], [(12, 12)], knob)
+            return [post.joined(place)]
         case "horns":
             horn = limb("back", [0.5, 0.3], [0.12, 0.11, 0.1], [(12, 12)])
-            for s in (-1, 1):  # on a hoop, in front and behind, where it has its tube
-                parts.append(
-                    horn.joined(
-                        (0, rear * s, 0) if hoop else (0.5 * wide * s, rear, 0), (0.3 * s, 0.1, 1)
-                    )
-                )
-    return Skeleton(Part(solid, children=tuple(parts)))
+            horns = []
+            for s in (-1, 1):
+                seat = (0.5 * wide * s, rear, 0)
+                if hoop:  # in front and behind, where it has its tube
+                    seat = (0, rear * s, 0)
+                horns.append(horn.joined(seat, (0.3 * s, 0.1, 1)))
+            return horns
+    return []
 
 
 def tool(g: np.random.Generator, shaft: str, head: str, pommel: str) -> Skeleton:
     """Build a shaft with a head and a pommel."""
-    style = LimbStyle.draw(g, shaft, head, g.uniform(1.1, 1.9), 0.13, 12.0)
-    root = replace(style, end=style.start * g.uniform(0.8, 1.25), curl=0.6 * style.curl).grow(
-        "shaft"
-    )
+    length = g.uniform(1.1, 1.9)
+    style = LimbStyle.draw(g, shaft, head, length, 0.13, 12.0)
+    end = style.start * g.uniform(0.8, 1.25)
+    root = replace(style, end=end, curl=0.6 * style.curl).grow("shaft")
     butt = ending(pommel, 0.95 * style.start, "pommel", ORIGIN, aim(DOWN))
     return Skeleton(replace(root, children=root.children + butt))
 
 
 def tongs(g: np.random.Generator, jaw: str, grip: str, arms: int) -> Skeleton:
     """Build two or three arms that cross at a pivot."""
-    front = g.uniform(0.6 if jaw in ("plain", "hook") else 0.85, 1.1)
+    shortest = 0.6 if jaw in ("plain", "hook") else 0.85
+    front = g.uniform(shortest, 1.1)
     rear = g.uniform(0.85, 1.3)
-    opening = g.uniform(26.0, 38.0) if arms == 2 else g.uniform(38.0, 48.0)
+    least, most = (26.0, 38.0) if arms == 2 else (38.0, 48.0)
+    opening = g.uniform(least, most)
     r = g.uniform(0.11, 0.14)
     tip = ending(jaw, 0.8 * r, "jaw", (0, 0, front))
     if grip == "bow":
-        tail = Part(Arc(rear, 1.0, r, 0.85 * r), "grip").joined(ORIGIN, DOWN, roll=0.5 * np.pi)
+        bow = Arc(rear, 1.0, r, 0.85 * r)
+        tail = Part(bow, "grip").joined(ORIGIN, DOWN, roll=0.5 * np.pi)
     else:
         end = ending(grip, 0.85 * r, "grip", (0, 0, rear))
-        tail = Part(Cone(rear, r, 0.85 * r), "grip", children=end).joined(ORIGIN, DOWN)
-    arm = Part(Cone(front, 1.1 * r, 0.8 * r), "jaw", (0, 7, 0), children=(*tip, tail))
-    parts = tuple(replace(arm, turn=turned("ZY", 360.0 * i / arms, opening)) for i in range(arms))
-    return Skeleton(Part(Blob((0.2, 0.15, 0.2)), "pivot", children=parts))
+        handle = Cone(rear, r, 0.85 * r)
+        tail = Part(handle, "grip", children=end).joined(ORIGIN, DOWN)
+    blade = Cone(front, 1.1 * r, 0.8 * r)
+    arm = Part(blade, "jaw", (0, 7, 0), children=(*tip, tail))
+    parts = []
+    for i in range(arms):
+        turn = turned("ZY", 360.0 * i / arms, opening)
+        parts.append(replace(arm, turn=turn))
+    pivot = Blob((0.2, 0.15, 0.2))
+    return Skeleton(Part(pivot, "pivot", children=tuple(parts)))
+
+
+# Number, kind, end and length of the limbs at the sides of a stack
+_STACKED_LIMBS = {
+    "bare": (0, "stub", "plain", 0.3),
+    "arms": (2, "jointed", "knob", 0.9),
+    "pegs": (4, "straight", "plain", 0.5),
+    "hoops": (2, "stub", "ring", 0.5),
+}
 
 
 def stack(g: np.random.Generator, layers: tuple[str, ...], side: str) -> Skeleton:
@@ -218,13 +260,17 @@ def stack(g: np.random.Generator, layers: tuple[str, ...], side: str) -> Skeleto
         solid: Solid
         match layer:
             case "ball":
-                solid = Blob((size, size, size * g.uniform(0.7, 1.2)))
+                upright = size * g.uniform(0.7, 1.2)
+                solid = Blob((size, size, upright))
                 high = 1.6 * size
             case "block":
-                solid = Box((1.7 * size, 1.7 * size * g.uniform(0.6, 1.0), 1.8 * size), 0.06)
+                wide = 1.7 * size
+                deep = wide * g.uniform(0.6, 1.0)
+                solid = Box((wide, deep, 1.8 * size), 0.06)
                 high = 1.7 * size
             case "plate":
-                solid = Prism(int(g.choice([3, 4, 6, 24])), 1.6 * size, 0.22, 0.08)
+                n_sides = int(g.choice([3, 4, 6, 24]))
+                solid = Prism(n_sides, 1.6 * size, 0.22, 0.08)
                 high = 0.18
             case "post":
                 solid = Prism(24, 0.2, 1.2 * size, 0.06)
@@ -232,20 +278,19 @@ def stack(g: np.random.Generator, layers: tuple[str, ...], side: str) -> Skeleto
             case _:
                 solid = Ring(size, 0.13)
                 high = 2.0 * size + 0.1
-        children = tuple(replace(child, at=(0, 0, high)) for child in children)
+        top = (0, 0, high)
+        middle = 0.5 * high
+        children = tuple(replace(child, at=top) for child in children)
         if i == 0:
             # A hoop has its limbs on the left and right, where it has its tube. Posts are thin whatever their height.
             reach = {"hoop": size, "post": 0.12}.get(layer, 0.85 * size)
-            count, kind, end, length = {
-                "bare": (0, "stub", "plain", 0.3),
-                "arms": (2, "jointed", "knob", 0.9),
-                "pegs": (2 if layer == "hoop" else 4, "straight", "plain", 0.5),
-                "hoops": (2, "stub", "ring", 0.5),
-            }[side]
+            count, kind, end, length = _STACKED_LIMBS[side]
+            if side == "pegs" and layer == "hoop":
+                count = 2
             arm = LimbStyle.draw(g, kind, end, length, 0.12).grow()
-            children += tuple(
-                arm.joined((reach * c, reach * s, 0.5 * high), (c, s, 0.3))
-                for c, s in circle(count)
-            )
-        children = (Part(solid, f"layer{i}", (7, 7, 12), lift=0.5 * high, children=children),)
+            for c, s in circle(count):
+                place = (reach * c, reach * s, middle)
+                children += (arm.joined(place, (c, s, 0.3)),)
+        part = Part(solid, f"layer{i}", (7, 7, 12), lift=middle, children=children)
+        children = (part,)
     return Skeleton(children[0])

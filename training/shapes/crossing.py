@@ -18,10 +18,13 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Integers:
     i, j = _candidates(corners).T
     # Each test leaves fewer pairs for the next, more expensive one.
     for axis in range(3):
-        boxes = (low[i, axis] <= high[j, axis]) & (low[j, axis] <= high[i, axis])
-        i = i[boxes]
-        j = j[boxes]
-    apart = ~(faces[i][:, :, None] == faces[j][:, None]).any(axis=(1, 2))
+        starts_before = low[i, axis] <= high[j, axis]
+        ends_behind = low[j, axis] <= high[i, axis]
+        overlaps = starts_before & ends_behind
+        i = i[overlaps]
+        j = j[overlaps]
+    is_common = faces[i][:, :, None] == faces[j][:, None]
+    apart = ~is_common.any(axis=(1, 2))
     i = i[apart]
     j = j[apart]
     a = corners[i]
@@ -29,27 +32,34 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Integers:
     crossed = np.zeros(len(i), dtype=bool)
     for first, second in ((a, b), (b, a)):
         for k in range(3):
-            crossed |= _passes(first[:, k], first[:, (k + 1) % 3], second)
+            start = first[:, k]
+            end = first[:, (k + 1) % 3]
+            crossed |= _passes(start, end, second)
     return np.stack([i[crossed], j[crossed]], axis=1)
 
 
 def _candidates(corners: Floats) -> Integers:
     """Pairs (N,2), the smaller index first, of faces whose balls around their centres may overlap."""
     centres = corners.mean(axis=1)
-    radii = np.sqrt(((corners - centres[:, None]) ** 2).sum(axis=2).max(axis=1))
+    offsets = corners - centres[:, None]
+    squares = (offsets**2).sum(axis=2)
+    radii = np.sqrt(squares.max(axis=1))
     max_small = float(np.quantile(radii, 0.9))
     small = np.nonzero(radii <= max_small)[0]
     large = np.nonzero(radii > max_small)[0]
-    candidates = [
-        small[cKDTree(centres[small]).query_pairs(2.0 * max_small, output_type="ndarray")]
-    ]
+    tree = cKDTree(centres[small])
+    near = tree.query_pairs(2.0 * max_small, output_type="ndarray")
+    candidates = [small[near]]
     if len(large):
         # The few large faces are searched one by one, so that they do not enlarge the search radius of all faces.
-        neighbours = cKDTree(centres).query_ball_point(centres[large], radii[large] + radii.max())
+        reach = radii[large] + radii.max()
+        neighbours = cKDTree(centres).query_ball_point(centres[large], reach)
         others = np.concatenate([np.asarray(row, dtype=np.int64) for row in neighbours])
-        pairs = np.stack([np.repeat(large, [len(row) for row in neighbours]), others], axis=1)
-        both_large = radii[pairs[:, 1]] > max_small
-        candidates.append(pairs[~both_large | (pairs[:, 0] < pairs[:, 1])])
+        own = np.repeat(large, [len(row) for row in neighbours])
+        is_small = radii[others] <= max_small
+        is_first = own < others
+        pairs = np.stack([own, others], axis=1)
+        candidates.append(pairs[is_small | is_first])
     return np.sort(np.concatenate(candidates), axis=1)
 
 
@@ -69,5 +79,7 @@ def _passes(start: Floats, end: Floats, triangle: Floats) -> Booleans:
     u = side(a, b)
     v = side(b, c)
     w = side(c, a)
-    inside = ((u > 0.0) & (v > 0.0) & (w > 0.0)) | ((u < 0.0) & (v < 0.0) & (w < 0.0))
-    return (above * below < 0.0) & inside
+    all_positive = (u > 0.0) & (v > 0.0) & (w > 0.0)
+    all_negative = (u < 0.0) & (v < 0.0) & (w < 0.0)
+    is_cut = above * below < 0.0
+    return is_cut & (all_positive | all_negative)

@@ -50,21 +50,24 @@ class Change:
         centres = np.empty((_N_REGIONS, 3))
         axes = np.empty((_N_REGIONS, 3))
         for i, seed_vertex in enumerate(rng.integers(len(vertices), size=_N_REGIONS)):
-            region = vertices[np.linalg.norm(vertices - vertices[seed_vertex], axis=1) < radii[i]]
+            away = np.linalg.norm(vertices - vertices[seed_vertex], axis=1)
+            region = vertices[away < radii[i]]
             centres[i] = region.mean(axis=0)
-            axis = np.linalg.svd(region - centres[i], full_matrices=False)[2][0]
-            axes[i] = axis * np.where(axis @ (centres[i] - vertices.mean(axis=0)) < 0.0, -1.0, 1.0)
+            _, _, principal = np.linalg.svd(region - centres[i], full_matrices=False)
+            axis = principal[0]
+            outward = centres[i] - vertices.mean(axis=0)
+            axes[i] = axis * np.where(axis @ outward < 0.0, -1.0, 1.0)
         swells, grows = rng.normal(size=(2, _N_REGIONS)) * rng.uniform(0.2, 1.0, (2, 1))
         waves = Warp.draw(rng, 2.0 * size, 0.5 * rng.uniform(0.2, 1.0))
         change = cls(waves, centres, axes, radii, swells, grows, np.zeros(7), 1.0)
         basis = _similarity_basis(vertices)
         steps = change(vertices) - vertices
-        similarity = np.linalg.lstsq(basis.reshape(-1, 7), steps.reshape(-1), rcond=None)[0].astype(
-            np.float64
-        )
-        change = replace(change, similarity=similarity)
-        largest = float(np.linalg.norm(change(vertices) - vertices, axis=1).max())
-        return replace(change, step=size * float(np.exp(rng.uniform(*np.log(shares)))) / largest)
+        fit = np.linalg.lstsq(basis.reshape(-1, 7), steps.reshape(-1), rcond=None)
+        change = replace(change, similarity=fit[0].astype(np.float64))
+        steps = change(vertices) - vertices
+        largest = float(np.linalg.norm(steps, axis=1).max())
+        share = float(np.exp(rng.uniform(*np.log(shares))))
+        return replace(change, step=size * share / largest)
 
     def __call__(self, points: Floats) -> Floats:
         steps = self.waves(points) - points
@@ -76,15 +79,13 @@ class Change:
             across = positions - along[:, None] * axis
             distances = np.linalg.norm(across, axis=1)
             near = np.exp(-0.5 * (distances**2 + along**2) / radius**2)
-            beyond = (
-                radius
-                * np.logaddexp(0.0, along / radius)
-                * np.exp(-0.5 * (distances / radius) ** 2)
-            )
-            steps = (
-                steps + 0.3 * swell * near[:, None] * across + 0.15 * grow * beyond[:, None] * axis
-            )
-        return points + self.step * (steps - _similarity_basis(points) @ self.similarity)
+            beside = np.exp(-0.5 * (distances / radius) ** 2)
+            beyond = radius * np.logaddexp(0.0, along / radius) * beside
+            swelling = 0.3 * swell * near[:, None] * across
+            growth = 0.15 * grow * beyond[:, None] * axis
+            steps = steps + swelling + growth
+        similar = _similarity_basis(points) @ self.similarity
+        return points + self.step * (steps - similar)
 
 
 @dataclass(frozen=True)
@@ -101,18 +102,17 @@ class ChangedWarp:
 def individual(body: Body, rng: np.random.Generator, shares: tuple[float, float] = SHARES) -> Body:
     """Draw an individual of a body: the body with a `Change` of its surface at rest."""
     vertices, faces = body.surface(_TRIAL_VERTICES, np.eye(3))
-    return replace(
-        body, warp=ChangedWarp(body.warp, Change.draw(rng, body.warp(vertices), faces, shares))
-    )
+    change = Change.draw(rng, body.warp(vertices), faces, shares)
+    return replace(body, warp=ChangedWarp(body.warp, change))
 
 
 def _similarity_basis(points: Floats) -> Floats:
     """(P,3,7) displacements of points (P,3) by translations, infinitesimal rotations, and scaling."""
     x, y, z = points.T
     zero = np.zeros(len(points))
-    turns = np.stack(
-        [np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], axis=2
-    )
-    return np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(points), 3, 3)), turns, points[:, :, None]], axis=2
-    )
+    about_x = np.stack([zero, -z, y], 1)
+    about_y = np.stack([z, zero, -x], 1)
+    about_z = np.stack([-y, x, zero], 1)
+    turns = np.stack([about_x, about_y, about_z], axis=2)
+    shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    return np.concatenate([shifts, turns, points[:, :, None]], axis=2)

@@ -18,28 +18,21 @@ class Prism(Solid):
     rounding: float
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        across, past_corner = _to_polygon(
-            self.sides, self.radius - self.rounding / np.cos(np.pi / self.sides), x, y
-        )
+        inner = self.radius - self.rounding / np.cos(np.pi / self.sides)
+        across, past_corner = _to_polygon(self.sides, inner, x, y)
         a = np.where(across > 0.0, np.hypot(across, past_corner), across)
         b = np.abs(z) - (0.5 * self.height - self.rounding)
-        return (
-            np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0))
-            + np.minimum(np.maximum(a, b), 0.0)
-            - self.rounding
-        )
+        outside = np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0))
+        inside = np.minimum(np.maximum(a, b), 0.0)
+        return outside + inside - self.rounding
 
     def box(self) -> tuple[Floats, Floats]:
         upper = np.array([self.radius, self.radius, 0.5 * self.height])
         return -upper, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
-        return Prism(
-            self.sides,
-            self.radius * thick,
-            self.height * length,
-            self.rounding * min(thick, length),
-        )
+        rounding = self.rounding * min(thick, length)
+        return Prism(self.sides, self.radius * thick, self.height * length, rounding)
 
 
 @dataclass(frozen=True)
@@ -56,10 +49,12 @@ class Frame(Solid):
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         across, past_corner = _to_polygon(self.sides, self.radius, x, y)
-        return np.sqrt(across * across + past_corner * past_corner + z * z) - self.tube
+        squares = across * across + past_corner * past_corner + z * z
+        return np.sqrt(squares) - self.tube
 
     def box(self) -> tuple[Floats, Floats]:
-        upper = np.array([self.radius + self.tube, self.radius + self.tube, self.tube])
+        wide = self.radius + self.tube
+        upper = np.array([wide, wide, self.tube])
         return -upper, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
@@ -74,5 +69,7 @@ def _to_polygon(sides: int, radius: float, x: Floats, y: Floats) -> tuple[Floats
     sector = np.pi / sides
     folded = np.mod(np.arctan2(y, x), 2.0 * sector) - sector
     radial = np.hypot(x, y)
-    past_corner = np.maximum(radial * np.abs(np.sin(folded)) - radius * np.sin(sector), 0.0)
-    return radial * np.cos(folded) - radius * np.cos(sector), past_corner
+    along = radial * np.abs(np.sin(folded))
+    past_corner = np.maximum(along - radius * np.sin(sector), 0.0)
+    across = radial * np.cos(folded) - radius * np.cos(sector)
+    return across, past_corner

@@ -30,11 +30,15 @@ def draw_turns(
         for joint, share, sign in zip(rod.joints, shares, signs, strict=True):
             limit = np.where(sign > 0.0, joint.high, -joint.low)
             # A joint that is nearly blocked in the drawn direction, such as a knee, bends in the other one.
-            direction = np.where(limit < 0.3 * np.maximum(joint.high, -joint.low), -1.0, 1.0) * sign
+            largest = np.maximum(joint.high, -joint.low)
+            direction = np.where(limit < 0.3 * largest, -1.0, 1.0) * sign
             limit = np.where(direction > 0.0, joint.high, -joint.low)
-            turn += _bent(rod, joint, (joint.axes * (direction * share * limit)).sum(axis=1))
+            angles = direction * share * limit
+            vector = (joint.axes * angles).sum(axis=1)
+            turn += _bent(rod, joint, vector)
         if len(rod.arc_lengths) > 1:
-            turn += _curled(rod, vigour * waves, planar) + _twisted(rod, twist)
+            curled = _curled(rod, vigour * waves, planar)
+            turn += curled + _twisted(rod, twist)
         turns.append(turn)
     return turns
 
@@ -51,11 +55,13 @@ def _bent(rod: Rod, joint: Joint, vector: Floats) -> Floats:
     radius = float(np.interp(joint.position, rod.arc_lengths, rod.radii))
     step = rod.arc_lengths[1]
     half = max(angle * radius / MAX_CURVATURE, 1.5 * step)
+    left = rod.length - joint.position
     if joint.is_root:
-        half = min(half, 0.5 * (rod.length - joint.position) + 0.25 * step)
+        half = min(half, 0.5 * left + 0.25 * step)
         middle = joint.position + half
     else:
-        half = min(half, max(min(joint.position, rod.length - joint.position), 1.5 * step))
+        room = min(joint.position, left)
+        half = min(half, max(room, 1.5 * step))
         middle = joint.position
     offset = (rod.arc_lengths - middle) / half
     bump = np.where(np.abs(offset) < 1.0, 1.0 + np.cos(np.pi * offset), 0.0)
@@ -74,12 +80,16 @@ def _curled(rod: Rod, waves: Floats, planar: bool) -> Floats:
     if rod.curl == 0.0:
         return np.zeros((len(rod.arc_lengths), 3))
     t = rod.arc_lengths / rod.length
-    shapes = np.stack([np.ones_like(t), 0.8 * np.cos(np.pi * t), 0.6 * np.cos(2.0 * np.pi * t)])
-    curvature = (waves[:, :, None] * shapes[None]).sum(axis=1) * np.array(
-        [1.0, 0.0 if planar else 0.6]
-    )[:, None]
-    max_angle = MAX_CURVATURE * rod.arc_lengths[1] / rod.bending_radii
-    angles = np.clip(curvature * rod.curl / len(t), -max_angle, max_angle)
+    even = np.ones_like(t)
+    half_wave = 0.8 * np.cos(np.pi * t)
+    whole_wave = 0.6 * np.cos(2.0 * np.pi * t)
+    shapes = np.stack([even, half_wave, whole_wave])
+    strengths = np.array([1.0, 0.0 if planar else 0.6])
+    curvature = (waves[:, :, None] * shapes[None]).sum(axis=1) * strengths[:, None]
+    step = rod.arc_lengths[1]
+    max_angle = MAX_CURVATURE * step / rod.bending_radii
+    angles = curvature * rod.curl / len(t)
+    angles = np.clip(angles, -max_angle, max_angle)
     angles[:, 0] = 0.0
     return np.einsum("kn,njk->nj", angles, rod.sides)
 
@@ -87,6 +97,7 @@ def _curled(rod: Rod, waves: Floats, planar: bool) -> Floats:
 def _twisted(rod: Rod, angle: float) -> Floats:
     """Rotation vectors (n,3) of an even twist."""
     tangent = surface.unit(np.gradient(rod.points, axis=0))
-    share = np.full(len(rod.arc_lengths), 1.0 / (len(rod.arc_lengths) - 1))
+    n_elements = len(rod.arc_lengths)
+    share = np.full(n_elements, 1.0 / (n_elements - 1))
     share[0] = 0.0
     return angle * share[:, None] * tangent

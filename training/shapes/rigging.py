@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -79,11 +80,14 @@ def bones_at_rest(skeleton: Skeleton, proportions: dict[str, tuple[float, float]
         thick, length = proportions.get(part.group, (1.0, 1.0))
         solid = part.solid.stretched(thick, length)
         factors = part.solid.factors(thick, length)
-        placed = Placed(solid, frame, origin + frame[:, 2] * (part.lift * factors[2]), part.blend)
+        lift = part.lift * factors[2]
+        centre = origin + frame[:, 2] * lift
+        placed = Placed(solid, frame, centre, part.blend)
         bones.append(Bone(part, placed, parent, origin, frame))
         number = len(bones) - 1
         for child in part.children:
-            at = origin + (frame * (factors * np.array(child.at))).sum(axis=1)
+            local = factors * np.array(child.at)
+            at = origin + (frame * local).sum(axis=1)
             place(child, number, frame @ child.turn, at)
 
     place(skeleton.root, -1, turned("z", 0.0), np.zeros(3))
@@ -104,32 +108,36 @@ def limb_rig(bones: Sequence[Bone], hinged: bool = False) -> Rig:
         if rod_of_bone[number] >= 0:
             continue
         chain = [number]
-        while not hinged and (successor := successors[chain[-1]]) is not None:
+        successor = None if hinged else successors[number]
+        while successor is not None:
             chain.append(successor)
+            successor = successors[successor]
         rod_of_bone[chain] = len(rods)
         parent = -1
         attachment = 0.0
         if bone.parent >= 0:
             parent = int(rod_of_bone[bone.parent])
             attachment = projected(rods[parent], bone.origin[None])[0]
-        rods.append(_rod([bones[i] for i in chain], bones, parent, attachment, hinged))
+        links = [bones[i] for i in chain]
+        rods.append(_rod(links, bones, parent, attachment, hinged))
     for number, rod in enumerate(rods):
-        solid = bones[int(np.argmax(rod_of_bone == number))].solid
-        if len(rod.arc_lengths) == 1 and rod.parent >= 0 and not isinstance(solid, Cone):
+        first = int(np.argmax(rod_of_bone == number))
+        solid = bones[first].solid
+        is_rigid = len(rod.arc_lengths) == 1
+        if is_rigid and rod.parent >= 0 and not isinstance(solid, Cone):
             low, high = solid.box()
-            rods[rod.parent] = _stiffened(
-                rods[rod.parent], rod.attachment, 0.5 * float((high - low).max())
-            )
+            half = 0.5 * float((high - low).max())
+            carrier = rods[rod.parent]
+            rods[rod.parent] = _stiffened(carrier, rod.attachment, half)
     return Rig(tuple(rods), rod_of_bone)
 
 
 def _stiffened(rod: Rod, attachment: float, half: float) -> Rod:
     """Reduce the bending of a rod near the attachment of a rigid solid of half extent `half`."""
     near = np.abs(rod.arc_lengths - attachment) < half
-    return replace(
-        rod,
-        bending_radii=np.where(near, np.maximum(rod.bending_radii, 1.5 * half), rod.bending_radii),
-    )
+    stiff = np.maximum(rod.bending_radii, 1.5 * half)
+    bending_radii = np.where(near, stiff, rod.bending_radii)
+    return replace(rod, bending_radii=bending_radii)
 
 
 def strip_rig(
@@ -147,10 +155,14 @@ def strip_rig(
     low = corners.min(axis=0)
     high = corners.max(axis=0)
     centre = 0.5 * (low + high)
-    half = 0.5 * float((np.abs(direction) * (high - low)).sum())
+    extent = high - low
+    half = 0.5 * float((np.abs(direction) * extent).sum())
     arc_lengths = np.linspace(0.0, 2.0 * half, MAX_ELEMENTS)
-    points = centre + (arc_lengths - half)[:, None] * direction
-    sides = np.tile(np.stack([axis, np.cross(direction, axis)], axis=1), (len(arc_lengths), 1, 1))
+    along = arc_lengths - half
+    points = centre + along[:, None] * direction
+    across = np.cross(direction, axis)
+    frame = np.stack([axis, across], axis=1)
+    sides = np.tile(frame, (len(arc_lengths), 1, 1))
     radii = np.full(len(arc_lengths), 0.5 * thickness)
     rod = Rod(-1, 0.0, points, arc_lengths, radii, radii, sides, curl=curl)
     return Rig((rod,), np.zeros(len(bones), dtype=np.int64))
@@ -167,16 +179,20 @@ def _successors(bones: Sequence[Bone]) -> list[int | None]:
             if child.parent != number or not any(child.part.bend):
                 continue
             reach = np.asarray(child.tip) - child.origin
-            beyond = float(((child.origin - bone.origin) * ahead).sum()) / length**2
-            aside = float(np.linalg.norm(np.cross(child.origin - bone.origin, ahead))) / length
-            cosine = float((reach * ahead).sum()) / (
-                length * max(float(np.linalg.norm(reach)), 1e-9)
-            )
+            reach_length = float(np.linalg.norm(reach))
+            offset = child.origin - bone.origin
+            beyond = float((offset * ahead).sum()) / length**2
+            aside = float(np.linalg.norm(np.cross(offset, ahead))) / length
+            cosine = float((reach * ahead).sum()) / (length * max(reach_length, 1e-9))
             if beyond > 0.85 and aside < 0.05 * length:
-                candidates.append((cosine, float(np.linalg.norm(reach)), other))
+                candidates.append((cosine, reach_length, other))
         if len(candidates) > 1:
-            candidates = sorted((x for x in candidates if x[0] > 0.9), key=lambda x: x[1])
-        successors.append(candidates[-1][2] if candidates and candidates[-1][0] > -0.3 else None)
+            straight = [candidate for candidate in candidates if candidate[0] > 0.9]
+            candidates = sorted(straight, key=itemgetter(1))
+        successor = None
+        if candidates and candidates[-1][0] > -0.3:
+            successor = candidates[-1][2]
+        successors.append(successor)
     return successors
 
 
@@ -185,36 +201,37 @@ def _rod(
 ) -> Rod:
     """The rod of a chain of bones, with a single element if no bone can bend."""
     line, radii, frames, starts = _centre_line(chain, parent < 0)
-    if len(line) == 1 or (parent >= 0 and not any(any(bone.part.bend) for bone in chain)):
-        return Rod(
-            parent, attachment, line[:1], np.zeros(1), radii[:1], radii[:1], frames[:1, :, :2]
-        )
-    line_lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    can_bend = parent < 0 or any(any(bone.part.bend) for bone in chain)
+    if len(line) == 1 or not can_bend:
+        sides = frames[:1, :, :2]
+        return Rod(parent, attachment, line[:1], np.zeros(1), radii[:1], radii[:1], sides)
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    line_lengths = np.concatenate([[0.0], np.cumsum(steps)])
     length = float(line_lengths[-1])
     radius = float(radii.mean())
-    n = int(np.clip(np.ceil(length / (0.3 * radius)), 8, MAX_ELEMENTS))
+    n_wanted = np.ceil(length / (0.3 * radius))
+    n = int(np.clip(n_wanted, 8, MAX_ELEMENTS))
     arc_lengths = np.linspace(0.0, length, n)
-    points = np.stack([np.interp(arc_lengths, line_lengths, line[:, i]) for i in range(3)], axis=1)
-    segment = np.clip(
-        np.searchsorted(line_lengths, arc_lengths, side="right") - 1, 0, len(frames) - 1
-    )
+    columns = [np.interp(arc_lengths, line_lengths, column) for column in line.T]
+    points = np.stack(columns, axis=1)
+    following = np.searchsorted(line_lengths, arc_lengths, side="right")
+    segment = np.clip(following - 1, 0, len(frames) - 1)
     sides = frames[segment][:, :, :2]
     radii = np.interp(arc_lengths, line_lengths, radii)
     rod = Rod(parent, attachment, points, arc_lengths, radii, radii, sides, is_hinge=hinged)
     spring = chain[0].solid
     if isinstance(spring, Helix):
         return replace(rod, curl=_OPENING_PER_TURN * spring.turns)
-    rod = replace(
-        rod, joints=_joints(chain, [float(line_lengths[start]) for start in starts], rod, bones)
-    )
+    bone_starts = [float(line_lengths[start]) for start in starts]
+    rod = replace(rod, joints=_joints(chain, bone_starts, rod, bones))
     if hinged:
         return rod
     slenderness = length / radius
-    is_curling = len(chain) >= 3 and slenderness > _MIN_CURL_SLENDERNESS
-    curl = min(np.radians(_CURL_LIMIT), 0.5 * slenderness) if is_curling else 0.06 * slenderness
-    return replace(
-        rod, curl=float(curl), twist=float(min(np.radians(_TWIST_LIMIT), _MAX_SHEAR * slenderness))
-    )
+    curl = 0.06 * slenderness
+    if len(chain) >= 3 and slenderness > _MIN_CURL_SLENDERNESS:
+        curl = min(np.radians(_CURL_LIMIT), 0.5 * slenderness)
+    twist = min(np.radians(_TWIST_LIMIT), _MAX_SHEAR * slenderness)
+    return replace(rod, curl=float(curl), twist=float(twist))
 
 
 def _joints(
@@ -229,43 +246,66 @@ def _joints(
             # The root bone is the spine, whose joint is in its middle.
             if rod.length > 2.0 * radius and not rod.is_hinge:
                 spine = np.radians([_SPINE_LIMIT, _SPINE_LIMIT])
-                middle = 0.5 * min(rod.length, float(np.linalg.norm(bone.tip - bone.origin)))
+                spine_length = float(np.linalg.norm(bone.tip - bone.origin))
+                middle = 0.5 * min(rod.length, spine_length)
                 joints.append(Joint(middle, axes, -spine, spine, False))
         elif any(bone.part.bend):
             low, high = _limits(bone, previous, rod.is_hinge)
             position = start
             if previous is None and not rod.is_hinge:
                 # A limb bends where it leaves the body that carries it.
-                outside = bones[bone.parent].placed.distance(*rod.points.T) > -0.2 * radius
-                position = float(rod.arc_lengths[int(np.argmax(outside))]) if outside.any() else 0.0
+                gaps = bones[bone.parent].placed.distance(*rod.points.T)
+                outside = gaps > -0.2 * radius
+                first = int(np.argmax(outside))
+                position = float(rod.arc_lengths[first]) if outside.any() else 0.0
             joints.append(Joint(position, axes, low, high, previous is None))
     return tuple(joints)
 
 
-def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Floats, Floats, Floats, list[int]]:
-    """Points, radii and frames along a chain of bones, and the index of the first point of each bone."""
+_Line = tuple[Floats, Floats, Floats, list[int]]
+"""Points, radii and frames along a chain of bones, and the index of the first point of each bone."""
+
+
+def _centre_line(chain: Sequence[Bone], is_root: bool) -> _Line:
     root = chain[0]
     if isinstance(root.solid, Helix):
-        share = np.linspace(0.0, 1.0, MAX_ELEMENTS)
-        local = np.array([root.solid.at(float(t)) for t in share])
-        outward = surface.unit(local * np.array([1.0, 1.0, 0.0]))
-        # A spring opens and closes about its axis.
-        axes = np.stack(
-            [np.tile([0.0, 0.0, 1.0], (len(share), 1)), outward, np.zeros_like(local)], axis=2
-        )
-        return root.placed.offset + local, np.full(len(share), root.solid.tube), axes, [0]
+        return _line_of_wire(root.solid, root.placed.offset)
     if is_root and len(chain) == 1 and not isinstance(root.solid, Cone | Arc):
-        # A trunk bends about its middle, along its longest side. A body without a long side is a rigid hub.
-        low, high = root.solid.box()
-        side = high - low
-        longest = int(np.argmax(side))
-        across = np.delete(np.arange(3), longest)
-        if side[longest] < 1.6 * side[across].max():
-            return root.placed.offset[None], np.array([0.5 * side.mean()]), root.frame[None], [0]
-        reach = 0.42 * side[longest] * root.frame[:, longest]
-        line = np.stack([root.placed.offset - reach, root.placed.offset + reach])
-        frame = np.stack([*root.frame[:, across].T, root.frame[:, longest]], axis=1)
-        return line, np.full(2, 0.25 * side[across].sum()), np.tile(frame, (2, 1, 1)), [0]
+        return _line_of_trunk(root)
+    return _line_of_limb(chain)
+
+
+def _line_of_wire(helix: Helix, offset: Floats) -> _Line:
+    """The line of a spring, which opens and closes about its axis."""
+    shares = np.linspace(0.0, 1.0, MAX_ELEMENTS)
+    local = np.array([helix.at(float(share)) for share in shares])
+    upward = np.tile([0.0, 0.0, 1.0], (len(shares), 1))
+    outward = surface.unit(local * np.array([1.0, 1.0, 0.0]))
+    frames = np.stack([upward, outward, np.zeros_like(local)], axis=2)
+    radii = np.full(len(shares), helix.tube)
+    return offset + local, radii, frames, [0]
+
+
+def _line_of_trunk(root: Bone) -> _Line:
+    """The line of a trunk, which bends about its middle, along its longest side; without a long side, a rigid hub."""
+    low, high = root.solid.box()
+    centre = root.placed.offset
+    side = high - low
+    longest = int(np.argmax(side))
+    across = np.delete(np.arange(3), longest)
+    if side[longest] < 1.6 * side[across].max():
+        radius = 0.5 * side.mean()
+        return centre[None], np.array([radius]), root.frame[None], [0]
+    axis = root.frame[:, longest]
+    reach = 0.42 * side[longest] * axis
+    line = np.stack([centre - reach, centre + reach])
+    first, second = root.frame[:, across].T
+    frame = np.stack([first, second, axis], axis=1)
+    radius = 0.25 * side[across].sum()
+    return line, np.full(2, radius), np.tile(frame, (2, 1, 1)), [0]
+
+
+def _line_of_limb(chain: Sequence[Bone]) -> _Line:
     points: list[Floats] = []
     radii: list[float] = []
     frames: list[Floats] = []
@@ -274,13 +314,15 @@ def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Floats, Floats, 
         starts.append(len(points))
         match bone.solid:
             case Arc(bow, angle, start, end):
-                t = np.linspace(0.0, 1.0, 12)[:-1]
-                local = np.stack(
-                    [0.0 * t, bow * (1.0 - np.cos(t * angle)), bow * np.sin(t * angle)], axis=1
-                )
-                points += list(bone.origin + (bone.frame[None] * local[:, None]).sum(axis=2))
-                radii += list(start + t * (end - start))
-                frames += [bone.frame] * len(t)
+                share = np.linspace(0.0, 1.0, 12)[:-1]
+                turn = share * angle
+                forward = bow * (1.0 - np.cos(turn))
+                upward = bow * np.sin(turn)
+                local = np.stack([0.0 * share, forward, upward], axis=1)
+                steps = (bone.frame[None] * local[:, None]).sum(axis=2)
+                points += list(bone.origin + steps)
+                radii += list(start + share * (end - start))
+                frames += [bone.frame] * len(share)
             case solid:
                 points.append(bone.origin)
                 radii.append(solid.start if isinstance(solid, Cone) else bone.radius)
@@ -294,20 +336,32 @@ def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Floats, Floats, 
 
 def _limits(bone: Bone, previous: Bone | None, hinged: bool) -> tuple[Floats, Floats]:
     """Limits of raise and swing, radians. A knee that is bent at rest bends further to the same side."""
-    factor, limit = (
-        (_ROOT_FACTOR, _ROOT_LIMIT) if previous is None else (_INNER_FACTOR, _INNER_LIMIT)
-    )
-    high = np.radians(np.minimum(factor * np.array(bone.part.bend[:2], dtype=float), limit))
-    if hinged:
-        high = np.radians(1.4 * np.array(bone.part.bend[:2], dtype=float))
+    factor = _INNER_FACTOR
+    limit = _INNER_LIMIT
+    if previous is None:
+        factor = _ROOT_FACTOR
+        limit = _ROOT_LIMIT
+    bend = np.array(bone.part.bend[:2], dtype=float)
+    degrees = 1.4 * bend if hinged else np.minimum(factor * bend, limit)
+    high = np.radians(degrees)
     low = -high
-    if previous is not None:
-        ahead = previous.frame[:, 2]
-        bent = bone.frame[:, 2] - ahead
-        lifted = float((np.cross(bone.frame[:, 0], bone.frame[:, 2]) * bent).sum())
-        if abs(lifted) > 0.04:
-            rest = float(np.arccos(np.clip((ahead * bone.frame[:, 2]).sum(), -1.0, 1.0)))
-            forward = max(min(high[0], np.radians(150.0) - rest), 0.2)
-            back = min(max(0.15 * high[0], 0.9 * rest), high[0])
-            low[0], high[0] = (-back, forward) if lifted > 0.0 else (-forward, back)
+    if previous is None:
+        return low, high
+    ahead = previous.frame[:, 2]
+    own = bone.frame[:, 2]
+    lift = np.cross(bone.frame[:, 0], own)
+    lifted = float((lift * (own - ahead)).sum())
+    if abs(lifted) <= 0.04:
+        return low, high
+    cosine = np.clip((ahead * own).sum(), -1.0, 1.0)
+    rest = float(np.arccos(cosine))
+    room = np.radians(150.0) - rest
+    forward = max(min(high[0], room), 0.2)
+    back = min(max(0.15 * high[0], 0.9 * rest), high[0])
+    if lifted > 0.0:
+        low[0] = -back
+        high[0] = forward
+    else:
+        low[0] = -forward
+        high[0] = back
     return low, high

@@ -100,15 +100,17 @@ def rod_motions(rig: Rig, turns: Sequence[Floats]) -> list[Motions]:
     for rod, turn in zip(rig.rods, turns, strict=True):
         motion = IDENTITY
         if rod.parent >= 0:
-            motion = _interpolated(
-                rig.rods[rod.parent], motions_of_rods[rod.parent], np.array(rod.attachment)
-            )
+            carrier = rig.rods[rod.parent]
+            carried = motions_of_rods[rod.parent]
+            motion = _interpolated(carrier, carried, np.array(rod.attachment))
         steps = rotations_about(rod.points, turn)
         real = np.empty((len(turn), 4))
         dual = np.empty((len(turn), 4))
         for j in range(len(turn)):
-            motion = compose(motion, Motions(steps.real[j], steps.dual[j]))
-            real[j], dual[j] = motion
+            step = Motions(steps.real[j], steps.dual[j])
+            motion = compose(motion, step)
+            real[j] = motion.real
+            dual[j] = motion.dual
         motions_of_rods.append(normalized(Motions(real, dual)))
     return motions_of_rods
 
@@ -120,9 +122,11 @@ def bind(vertices: Floats, faces: Integers, rig: Rig, placed: Sequence[Placed]) 
     """
     n_rods = len(rig.rods)
     if n_rods == 1:
-        return Binding(np.ones((len(vertices), 1)), projected(rig.rods[0], vertices)[:, None])
+        arc_lengths = projected(rig.rods[0], vertices)
+        return Binding(np.ones((len(vertices), 1)), arc_lengths[:, None])
     distances = np.stack([solid.distance(*vertices.T) for solid in placed])
-    nearest = rig.rod_of_solid[np.argmin(distances, axis=0)]
+    nearest_solid = np.argmin(distances, axis=0)
+    nearest = rig.rod_of_solid[nearest_solid]
     values = np.zeros((len(vertices), 2 * n_rods))
     width = np.zeros(len(vertices))
     for number, rod in enumerate(rig.rods):
@@ -134,11 +138,14 @@ def bind(vertices: Floats, faces: Integers, rig: Rig, placed: Sequence[Placed]) 
         values[own, n_rods + number] = arc_lengths
         width[own] = np.interp(arc_lengths, rod.arc_lengths, rod.radii)
     diffused = _diffused(vertices, faces, values, _DIFFUSION_WIDTH * width)
-    weights = np.maximum(diffused[:, :n_rods], 0.0)
+    spread = diffused[:, :n_rods]
+    weights = np.maximum(spread, 0.0)
     weights[weights < 1e-3] = 0.0
-    arc_lengths = diffused[:, n_rods:] / np.maximum(diffused[:, :n_rods], 1e-6)
-    arc_lengths = np.clip(arc_lengths, 0.0, np.array([rod.length for rod in rig.rods]))
-    return Binding(weights / weights.sum(axis=1, keepdims=True), arc_lengths)
+    weights /= weights.sum(axis=1, keepdims=True)
+    arc_lengths = diffused[:, n_rods:] / np.maximum(spread, 1e-6)
+    lengths = np.array([rod.length for rod in rig.rods])
+    arc_lengths = np.clip(arc_lengths, 0.0, lengths)
+    return Binding(weights, arc_lengths)
 
 
 def bend(
@@ -149,7 +156,8 @@ def bend(
     dual = np.zeros((len(vertices), 4))
     for number, rod in enumerate(rig.rods):
         own = np.nonzero(binding.weights[:, number])[0]
-        motions = _interpolated(rod, motions_of_rods[number], binding.arc_lengths[own, number])
+        arc_lengths = binding.arc_lengths[own, number]
+        motions = _interpolated(rod, motions_of_rods[number], arc_lengths)
         weights = binding.weights[own, number, None]
         real[own] += weights * motions.real
         dual[own] += weights * motions.dual
@@ -169,20 +177,20 @@ class Gaps:
         """Find the pairs of elements of all rods that are apart at rest."""
         points = np.concatenate([rod.points for rod in rig.rods])
         radii = np.concatenate([rod.radii for rod in rig.rods])
-        distance = np.sqrt(((points[:, None] - points[None]) ** 2).sum(axis=2))
-        first, second = np.nonzero(
-            np.triu(distance > _MIN_SEPARATION * (radii[:, None] + radii[None]))
-        )
+        offsets = points[:, None] - points[None]
+        distance = np.sqrt((offsets**2).sum(axis=2))
+        radius_sums = radii[:, None] + radii[None]
+        is_apart = distance > _MIN_SEPARATION * radius_sums
+        first, second = np.nonzero(np.triu(is_apart))
         return cls(first, second, radii[first] + radii[second])
 
     def smallest(self, rig: Rig, motions_of_rods: Sequence[Motions]) -> float:
         """Return the smallest gap in a pose: negative if elements overlap, infinite if there are no pairs."""
         pairs = zip(rig.rods, motions_of_rods, strict=True)
         points = np.concatenate([transform(motions, rod.points) for rod, motions in pairs])
-        gap = (
-            np.sqrt(((points[self.first] - points[self.second]) ** 2).sum(axis=1))
-            - self.radius_sums
-        )
+        offsets = points[self.first] - points[self.second]
+        distances = np.sqrt((offsets**2).sum(axis=1))
+        gap = distances - self.radius_sums
         return float(gap.min(initial=np.inf))
 
 
@@ -192,9 +200,11 @@ def projected(rod: Rod, points: Floats) -> Floats:
         return np.zeros(len(points))
     _, nearest = cKDTree(rod.points).query(points)
     tangent = surface.unit(np.gradient(rod.points, axis=0))
-    ahead = ((points - rod.points[nearest]) * tangent[nearest]).sum(axis=1)
+    offsets = points - rod.points[nearest]
+    ahead = (offsets * tangent[nearest]).sum(axis=1)
     step = rod.arc_lengths[1]
-    return np.clip(rod.arc_lengths[nearest] + np.clip(ahead, -step, step), 0.0, rod.length)
+    ahead = np.clip(ahead, -step, step)
+    return np.clip(rod.arc_lengths[nearest] + ahead, 0.0, rod.length)
 
 
 def _interpolated(rod: Rod, motions: Motions, arc_lengths: Floats) -> Motions:
@@ -202,10 +212,11 @@ def _interpolated(rod: Rod, motions: Motions, arc_lengths: Floats) -> Motions:
     n_elements = len(rod.arc_lengths)
     if n_elements == 1:
         shape = (*arc_lengths.shape, 4)
-        return Motions(
-            np.broadcast_to(motions.real[0], shape), np.broadcast_to(motions.dual[0], shape)
-        )
-    position = np.clip(arc_lengths / rod.arc_lengths[1] - 0.5, 0.0, n_elements - 1.0)
+        real = np.broadcast_to(motions.real[0], shape)
+        dual = np.broadcast_to(motions.dual[0], shape)
+        return Motions(real, dual)
+    position = arc_lengths / rod.arc_lengths[1] - 0.5
+    position = np.clip(position, 0.0, n_elements - 1.0)
     lower = np.minimum(position.astype(np.int64), n_elements - 2)
     share = (position - lower)[..., None]
     blend = [(1.0 - share) * part[lower] + share * part[lower + 1] for part in motions]
@@ -217,24 +228,23 @@ def _diffused(vertices: Floats, faces: Integers, values: Floats, width: Floats) 
     corners = vertices[faces]
     edges = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
     squared = np.einsum("fij,fij->fi", edges, edges)
-    double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)[:, None]
-    cotangents = (squared.sum(axis=1, keepdims=True) - 2.0 * squared) / (
-        2.0 * np.maximum(double_area, 1e-12)
-    )
+    normals = np.cross(edges[:, 0], edges[:, 1])
+    double_area = np.linalg.norm(normals, axis=1)[:, None]
+    adjacent = squared.sum(axis=1, keepdims=True) - 2.0 * squared
+    cotangents = adjacent / (2.0 * np.maximum(double_area, 1e-12))
+    squared_width = (width[faces] ** 2).mean(axis=1)[:, None]
     # Weights of edges must be positive, so that no weight of a vertex becomes negative.
-    conductance = np.maximum(cotangents, 0.02) * 0.25 * (width[faces] ** 2).mean(axis=1)[:, None]
+    conductance = np.maximum(cotangents, 0.02) * 0.25 * squared_width
     i = np.roll(faces, -1, axis=1).ravel()
     j = np.roll(faces, -2, axis=1).ravel()
     n = len(vertices)
     off_diagonal = coo_array((conductance.ravel(), (i, j)), shape=(n, n)).tocsc()
     off_diagonal = off_diagonal + off_diagonal.T
     mass = surface.vertex_areas(vertices, faces)
-    matrix = (
-        diags_array(mass + np.asarray(off_diagonal.sum(axis=1)).ravel()) - off_diagonal
-    ).tocsc()
-    solver = splu(
-        matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
-    )
+    sums = np.asarray(off_diagonal.sum(axis=1)).ravel()
+    matrix = (diags_array(mass + sums) - off_diagonal).tocsc()
+    symmetric = {"SymmetricMode": True}
+    solver = splu(matrix, permc_spec="MMD_AT_PLUS_A", options=symmetric, diag_pivot_thresh=0.0)
     for _ in range(2):
         values = solver.solve(mass[:, None] * values)
     return values

@@ -22,27 +22,27 @@ class Helix(Solid):
     def at(self, share: float) -> Vector:
         """Return the point of the centre line at a share of its length."""
         angle = 2.0 * np.pi * self.turns * share
-        return (
-            self.radius * float(np.cos(angle)),
-            self.radius * float(np.sin(angle)),
-            self.pitch * self.turns * share,
-        )
+        x = self.radius * float(np.cos(angle))
+        y = self.radius * float(np.sin(angle))
+        return x, y, self.pitch * self.turns * share
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        slope = self.pitch / (2.0 * np.pi * self.radius)
+        around = 2.0 * np.pi * self.radius
+        slope = self.pitch / around
         here = np.arctan2(y, x) / (2.0 * np.pi)
         squared = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), np.inf)
         base = np.round(z / self.pitch - here)
         for step in (-1.0, 0.0, 1.0):  # the nearest turn, and the turns below and above
             turn = here + base + step
             # The nearest point of the helix is shifted along the wire from the point at the same angle.
-            turn = turn + (z - turn * self.pitch) * slope / (1.0 + slope**2) / (
-                2.0 * np.pi * self.radius
-            )
+            above = z - turn * self.pitch
+            turn = turn + above * slope / (1.0 + slope**2) / around
             turn = np.clip(turn, 0.0, self.turns)
             angle = 2.0 * np.pi * turn
-            gap = (x - self.radius * np.cos(angle)) ** 2 + (y - self.radius * np.sin(angle)) ** 2
-            squared = np.minimum(squared, gap + (z - turn * self.pitch) ** 2)
+            dx = x - self.radius * np.cos(angle)
+            dy = y - self.radius * np.sin(angle)
+            dz = z - turn * self.pitch
+            squared = np.minimum(squared, dx**2 + dy**2 + dz**2)
         for end in (0.0, 1.0):
             cx, cy, cz = self.at(end)
             squared = np.minimum(squared, (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
@@ -50,17 +50,12 @@ class Helix(Solid):
 
     def box(self) -> tuple[Floats, Floats]:
         wide = self.radius + self.tube
-        return np.array([-wide, -wide, -self.tube]), np.array(
-            [wide, wide, self.pitch * self.turns + self.tube]
-        )
+        high = self.pitch * self.turns + self.tube
+        return np.array([-wide, -wide, -self.tube]), np.array([wide, wide, high])
 
     def stretched(self, thick: float, length: float) -> Solid:
-        return Helix(
-            self.radius * length,
-            self.pitch * length,
-            self.turns,
-            min(self.tube * thick, 0.4 * self.pitch),
-        )
+        tube = min(self.tube * thick, 0.4 * self.pitch)
+        return Helix(self.radius * length, self.pitch * length, self.turns, tube)
 
     def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)
@@ -68,7 +63,10 @@ class Helix(Solid):
 
 def coil(g: np.random.Generator, turns: float, end: str) -> Skeleton:
     """Build a spring: a wire wound around z, with or without parts at its ends."""
-    solid = Helix(g.uniform(0.4, 0.6), g.uniform(0.34, 0.46), turns, g.uniform(0.1, 0.125))
+    radius = g.uniform(0.4, 0.6)
+    pitch = g.uniform(0.34, 0.46)
+    tube = g.uniform(0.1, 0.125)
+    solid = Helix(radius, pitch, turns, tube)
     children: tuple[Part, ...] = ()
     if end != "plain":
         end_solid = {"knob": Blob((0.2, 0.2, 0.2)), "disc": Prism(16, 0.3, 0.2, 0.07)}[end]
