@@ -14,8 +14,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 from itertools import pairwise
+from operator import or_
 from pathlib import Path
 from statistics import mean, stdev
 
@@ -368,7 +369,7 @@ def run_families(
 ) -> None:
     """Train on a few bodies of each family, and print how many of two other bodies in two poses are recognised."""
     torch.set_num_threads(1)
-    dataset = families(folder, igps.descriptor("interior"), igps.descriptor("pretrained"))
+    dataset = families(folder, *_described())
     _few_labels(dataset, split_families, methods, seeds, labels, n_steps)
 
 
@@ -437,11 +438,17 @@ def split_classes(
     return train, list(split.test)
 
 
+def _described() -> list[igps.Descriptor]:
+    """Return the descriptors whose data the methods need."""
+    return [igps.descriptor("interior"), igps.descriptor("pretrained"), Numbers()]
+
+
 def _dataset(
     root: Path | list[Path], cache_dir: Path, methods: list[str], labels: list[str] | None = None
 ) -> igps.SignatureDataset:
     """Return a collection with all that the methods need, after its signatures are computed."""
-    needed = igps.descriptor("interior").requirements | igps.descriptor("pretrained").requirements
+    requirements = [descriptor.requirements for descriptor in _described()]
+    needed = reduce(or_, requirements)
     dataset = igps.SignatureDataset(root, descriptor=needed, cache_dir=cache_dir, labels=labels)
     if methods != ["resnet"]:  # which reads meshes alone
         dataset.precompute(strict=True, n_workers=1)
