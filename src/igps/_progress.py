@@ -1,12 +1,20 @@
 """A bar on standard error that tells how far a long computation is."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from itertools import count
 from typing import Any
 
 from tqdm import tqdm
 
 _SECONDS = 60  # between the lines in a file
+_NUMBERS: ContextVar[Iterator[str] | None] = ContextVar("numbers of bars", default=None)
+
+
+def number_bars(total: int | None) -> None:
+    """Number the bars that follow, as in "2/3 descriptions", by the number of steps of a command; None ends it."""
+    _NUMBERS.set(None if total is None else (f"{i}/{total} " for i in count(1)))
 
 
 class Progress(tqdm):
@@ -17,6 +25,9 @@ class Progress(tqdm):
     """
 
     def __init__(self, iterable: Any = None, **options: Any) -> None:
+        numbers = _NUMBERS.get()
+        if numbers is not None and not options.get("disable"):
+            options["desc"] = next(numbers) + options["desc"]
         self._is_in_file = not (options.get("file") or sys.stderr).isatty()
         if self._is_in_file:
             options |= {"delay": _SECONDS, "mininterval": _SECONDS, "maxinterval": _SECONDS}

@@ -8,8 +8,10 @@ from commands import run
 from own_descriptors import SMALL, write_egg
 
 INTERIOR = "own_descriptors:small_interior"
-# Such as "signatures: 4/4 [00:03<00:00]": how many of how many, time taken and left
-BAR = re.compile(r"^([\w -]+): (\d+)/(\d+) \[\d\d:\d\d<(?:\d\d:\d\d|\?)\]$", re.MULTILINE)
+# Such as "1/3 signatures: 4/4 [00:03<00:00]": the step, how many of how many, time taken and left
+BAR = re.compile(
+    r"^(?:\d/\d )?([\w -]+): (\d+)/(\d+) \[\d\d:\d\d<(?:\d\d:\d\d|\?)\]$", re.MULTILINE
+)
 
 
 @pytest.fixture
@@ -91,3 +93,26 @@ def test_a_bar_tells_how_far_it_is_and_what_time_is_left(command, expected, root
         name: total for name, total in expected.items() if total is not None
     }
     assert not bars(printed.out)
+
+
+@pytest.mark.parametrize(
+    ("command", "n_steps"),
+    [
+        ("retrieve ROOT --descriptor INTERIOR SMALL", 3),
+        ("retrieve ROOT --descriptor INTERIOR SMALL --out OUT --report", 5),
+        ("extract ROOT --out OUT.csv --descriptor INTERIOR SMALL", 2),
+        ("compare ROOT --descriptors INTERIOR SMALL", 3),
+        ("query MESH --gallery ROOT --descriptor INTERIOR SMALL", 4),
+        ("fit ROOT --out OUT.safetensors --descriptor INTERIOR SMALL", 2),
+        ("clusters ROOT --descriptor INTERIOR SMALL --out OUT", 3),
+        ("gallery build ROOT --out OUT.igps --descriptor INTERIOR SMALL", 2),
+    ],
+)
+def test_bars_are_numbered_by_the_steps_of_the_command(command, n_steps, root, tmp_path, capsys):
+    words = {"ROOT": root, "MESH": root / "egg" / "0.off", "INTERIOR": INTERIOR}
+    words |= {"SMALL": " ".join(SMALL), "OUT": tmp_path / "out"}
+    for word, value in words.items():
+        command = re.sub(rf"\b{word}\b", str(value), command)
+    run(*command.split(), "--cache_dir", str(tmp_path / "cache"), "--n_workers", "1")
+    numbers = re.findall(r"^(\d)/(\d) [a-z]", capsys.readouterr().err, re.MULTILINE)
+    assert sorted(set(numbers)) == [(str(i + 1), str(n_steps)) for i in range(n_steps)]

@@ -48,6 +48,7 @@ def clusters(
         out: folder for clusters.csv and clusters.json with the cluster of each body and its place on the map, the tree
             as clusters.svg and clusters.png, and the map as map.svg and map.png.
     """
+    from igps._progress import number_bars
     from igps.analysis.clusters import STABLE, clusters_of
     from igps.analysis.comparison import pair_distances
     from igps.analysis.map import body_map, import_umap
@@ -73,6 +74,7 @@ def clusters(
         if colour not in _OWN_COLOURS:
             bodies.column(colour)
 
+    number_bars(3)
     described_bodies = described(Folder(root, check=check), descriptor, **describing)
     dataset = described_bodies.dataset
     module = described_bodies.descriptor

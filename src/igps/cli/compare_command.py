@@ -41,6 +41,7 @@ def compare(
             meshes, and failures.csv if there are failures.
         report: also write a page of results to the folder of --out, report.html, see igps report
     """
+    from igps._progress import number_bars
     from igps.analysis.comparison import check_names
     from igps.analysis.comparison import compare as compare_descriptors
     from igps.analysis.plain_numbers import plain_scores
@@ -65,6 +66,7 @@ def compare(
     check_names(
         [module.name.replace(SIZE, "") if size == "keep" else module.name for module in modules]
     )
+    number_bars(2 + len(names) + report)  # signatures, descriptions, distances by each, pictures
     dataset, failures = signatures(
         Folder(root, labelled=True),
         modules,

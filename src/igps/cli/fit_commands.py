@@ -53,6 +53,7 @@ def fit(
             takes the best on held-out bodies.
         no_prior: ignore the descriptor's own metric, and fit to its histograms alone
     """
+    from igps._progress import number_bars
     from igps.cli.reading import Folder, print_failures, signatures
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.measures import Measures
@@ -70,6 +71,7 @@ def fit(
     specification(base)  # raises for a descriptor that cannot be saved, before anything is computed
     check_centres(base)
     folder = Folder(root, labelled=True, check=partial(check_classes, goal=goal))
+    number_bars(2)
     dataset, unread = signatures(
         folder,
         [base],

@@ -35,6 +35,7 @@ def build(
     Args:
         out: folder of the gallery, such as gallery.igps; created if missing.
     """
+    from igps._progress import number_bars
     from igps.cli.reading import Folder, signatures, with_side, with_size
     from igps.descriptors import descriptor as descriptor_of
     from igps.gallery.gallery import Gallery
@@ -50,6 +51,7 @@ def build(
     module = descriptor_of(descriptor)
     check_centres(module)
     tables().check_place(out)
+    number_bars(2)
     dataset, unread = signatures(
         Folder(root), [module], n_workers=n_workers, strict=strict, **reading
     )

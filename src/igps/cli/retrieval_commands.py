@@ -45,6 +45,7 @@ def retrieve(
         rerank: also re-rank the distances by k-reciprocal neighbours, without labels, and print their
             scores in a second table; distances.npz holds them as "reranked".
     """
+    from igps._progress import number_bars
     from igps.analysis.comparison import pair_distances
     from igps.cli.reading import Folder, described
     from igps.cli.report_command import check_report_folder
@@ -57,6 +58,7 @@ def retrieve(
         raise ValueError("report: expected no --queries with it: on the page, each body asks.")
     check = partial(_check_scored, queries=queries, needs_scores=out is None)
     folder = Folder(root, labelled=True, check=check)
+    number_bars(3 + (out is not None) + report)
     result = described(folder, descriptor, also=Measures.requirements, **describing)
     is_query = check(result.dataset.bodies)
     distances = {"distances": pair_distances(result.descriptor, result.descriptions, progress=True)}
@@ -129,6 +131,7 @@ def extract(
         wide: write one row per file, or per folder with one mask file per organ, and columns such as PART.volume_mm3
             for each of its bodies.
     """
+    from igps._progress import number_bars
     from igps.cli.feature_table import SUFFIXES
     from igps.cli.reading import described, files_or_folder, write_mending_notes
     from igps.descriptors import descriptor as descriptor_of
@@ -148,6 +151,7 @@ def extract(
             f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}."
         )
     also = None if is_archive else Measures.requirements
+    number_bars(2)
     result = described(files_or_folder(meshes), descriptor, also=also, **describing)
     out.parent.mkdir(parents=True, exist_ok=True)
     if is_archive:
@@ -220,6 +224,7 @@ def query(
         rerank: re-rank the nearest 200 bodies by their common neighbours (k-reciprocal, without labels);
             the listed distances are the re-ranked ones.
     """
+    from igps._progress import number_bars
     from igps.cli.gallery_commands import gallery_options
     from igps.cli.reading import Folder, check_files, described
     from igps.gallery.gallery import Gallery
@@ -231,6 +236,7 @@ def query(
     check_files([mesh])
     if is_gallery(gallery):
         opened = Gallery(gallery, descriptor)
+        number_bars(2)
         description = _describe_body(mesh, opened.descriptor, **gallery_options(opened, describing))
         matches = opened.nearest(description, top=top, rerank=rerank, where=where, exact=exact)[0]
         n_missing = sum(not match.path.exists() for match in matches)
@@ -240,6 +246,7 @@ def query(
             f"where: expected a gallery, {gallery} is a folder of meshes. See igps gallery build."
         )
     else:
+        number_bars(4)
         known = described(Folder(gallery), descriptor or "pretrained", **describing)
         n_missing = 0
         # The query is described with the options of the folder
