@@ -135,8 +135,8 @@ def test_every_import_is_declared():
             used |= names
     # And nothing is declared that is not used.
     assert core <= used
-    # trimesh imports these, where a format asks for them
-    assert optional - extras["formats"] - extras["cad"] <= used
+    # trimesh imports that of CAD
+    assert optional - extras["cad"] <= used
 
 
 def test_modules_that_import_at_once_need_no_extra():
