@@ -7,6 +7,7 @@ import math
 from typing import NamedTuple, cast
 
 import numpy as np
+from numpy.polynomial import Chebyshev, Polynomial
 
 from igps._arrays import Booleans, Floats, Integers
 from igps._compiled import FUSE, compiled
@@ -20,6 +21,14 @@ _ZERO = cast(int, np.int64(0))
 _N_PAIRS = 128
 # Half-diagonals; points closer than this are on the surface, or in the plane of a face
 _ON_SURFACE = 2e-9
+_TAN = math.tan(math.pi / 8)
+# Coefficients of arctan(√q)/√q for √q ≤ tan π/8, accurate to rounding, from the highest power down.
+_ARCTAN = tuple(
+    Chebyshev.interpolate(lambda q: np.arctan(np.sqrt(q)) / np.sqrt(q), 12, domain=[1e-9, _TAN**2])
+    .convert(kind=Polynomial)
+    .coef[::-1]
+    .tolist()
+)
 
 
 @compiled()
@@ -325,9 +334,21 @@ def add_faces(
                 touched.barycentric[i, corner] = max(areas[corner], 0.0) / total_area
 
 
-@compiled()
+@compiled(fastmath=FUSE)
 def divide_angles(squares: Floats, cosines: Floats) -> None:
-    """Replace squared lengths by angles over lengths, arctan2(length, cosine) / length."""
+    """Replace squared lengths by angles over lengths, arctan2(length, cosine) / length, accurate to rounding."""
     for m in range(len(squares)):
-        length = max(math.sqrt(squares[m]), 1e-150)
-        squares[m] = math.atan2(length, cosines[m]) / length
+        y = max(math.sqrt(squares[m]), 1e-150)
+        cosine = cosines[m]
+        x = abs(cosine)
+        small = min(x, y)
+        large = max(x, y)
+        steep = small > _TAN * large
+        z = (small - large if steep else small) / (small + large if steep else large)
+        q = z * z
+        series = 0.0
+        for coefficient in _ARCTAN:
+            series = series * q + coefficient
+        angle = z * series + (math.pi / 4 if steep else 0.0)
+        angle = math.pi / 2 - angle if y > x else angle
+        squares[m] = (math.pi - angle if cosine < 0 else angle) / y

@@ -10,6 +10,9 @@ from igps._threads import SERIAL, Team
 
 # Entries of the largest basis that has a copy in single precision, of 1 GiB.
 MAX_SINGLE_ENTRIES = 2**28
+# Entries of the largest basis, 128 MiB, that NumPy allocates with huge pages. They make products faster, but for a
+# larger basis it costs more to wait for them.
+MAX_HUGE_PAGE_ENTRIES = 2**24
 # Smallest piece of the columns, and largest number of pieces; a thread works on one piece at a time.
 MIN_PIECE_COLUMNS = 2**12
 MAX_PIECES = 8
@@ -41,11 +44,18 @@ class Basis:
 
     def _allocate(self, n_rows: int, n_columns: int) -> None:
         """Allocate a new basis. Memory of NumPy, unlike that of PyTorch, can be released in part later."""
-        self._memory = np.empty((n_rows, n_columns))
-        self._basis = torch.from_numpy(self._memory)
-        self._single = None
-        if not self.overwrites_basis:
-            self._single = torch.from_numpy(np.empty((n_rows, n_columns), np.float32))
+        shape = n_rows, n_columns
+        self._memory = np.empty(shape if self.overwrites_basis else (0, n_columns))
+        if self.overwrites_basis:
+            self._basis = torch.from_numpy(self._memory)
+            self._single = None
+        elif n_rows * n_columns <= MAX_HUGE_PAGE_ENTRIES:
+            self._basis, self._single = (
+                torch.from_numpy(np.empty(shape, dtype)) for dtype in (np.float64, np.float32)
+            )
+        else:
+            self._basis = torch.empty(shape, dtype=torch.float64, device="cpu")
+            self._single = torch.empty(shape, dtype=torch.float32, device="cpu")
 
     def _sum_pieces(
         self, function: Callable[[slice], tuple[torch.Tensor, ...]]
