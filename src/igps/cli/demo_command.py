@@ -13,6 +13,7 @@ def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[s
         out: folder for the meshes, the results of igps retrieve and of igps clusters, and report.html.
         n_workers: number of worker processes; by default one for each core.
     """
+    from igps._progress import number_bars
     from igps.cli.clusters_command import clusters
     from igps.cli.report_command import report
     from igps.cli.retrieval_commands import retrieve
@@ -25,5 +26,6 @@ def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[s
     summary = retrieve(out / "shapes", **options)
     clusters(out / "shapes", colour="class", **options)
     print(f"map of the shapes: {out / 'map.png'}")
+    number_bars(None)
     report(out, n_workers=n_workers)
     return summary
