@@ -31,6 +31,10 @@ init_args:
       axes: [potential, {class_path: igps.nn.axes.InteriorDistance, init_args: {n_bins: 64}}]
       embedding: {class_path: igps.nn.embedding.SpectralEmbedding, init_args: {n_eigenpairs: 250}}
 """
+# Lists of ten aliases of a list of ten aliases: 10⁹ values in a few lines
+ALIASES = "a0: &a0 [1]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 10)
+)
 PRETRAINED = yaml.safe_dump(specification(pretrained_parts()))
 HEIGHT = """
 class_path: igps.nn.descriptor.HistogramDescriptor
@@ -91,6 +95,8 @@ def test_a_descriptor_of_the_library_written_down_gives_the_same_numbers(
             "axes: expected one of potential, .*'colour'",
         ),
         (INTERIOR.replace("n_bins: 64", "n_bins: 100000000"), "is too large"),
+        (INTERIOR + "#" * 100_000, "at most 100000 bytes"),
+        (ALIASES, "at most 10000 values"),
         (
             HEIGHT.replace("quantiles: 4", "quantiles: 1"),
             "expected centres, or at least 2 quantiles",

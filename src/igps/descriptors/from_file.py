@@ -2,6 +2,8 @@
 
 import math
 import os
+from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,9 @@ from igps.nn.heads import ClassifierHead, Head
 from igps.nn.specification import IN_FOLDER, build_module, load_module
 
 _YAML = (".yaml", ".yml")
+# Limits of a YAML file, which may come from strangers: its size, and the values in it, which aliases can multiply
+_MAX_BYTES = 100_000
+_MAX_VALUES = 10_000
 # What a specification can raise that is none, or names what is not there
 _UNREADABLE = (ValueError, TypeError, AttributeError, LookupError, ImportError, RecursionError)
 
@@ -76,11 +81,27 @@ def _written_module(path: Path) -> nn.Module:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file. Check the path.")
     try:
-        module = build_module(yaml.safe_load(path.read_text(encoding="utf-8")))
+        n_bytes = path.stat().st_size
+        if n_bytes > _MAX_BYTES:
+            raise ValueError(f"expected at most {_MAX_BYTES} bytes, got {n_bytes}")
+        spec = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if any(True for _ in islice(_values(spec), _MAX_VALUES, None)):
+            raise ValueError(f"expected at most {_MAX_VALUES} values, got more")
+        module = build_module(spec)
     except (*_UNREADABLE, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path}: expected a descriptor ({reason}). Correct it.") from error
     return module.eval()
+
+
+def _values(value: Any) -> Iterator[Any]:
+    """Yield a value and all values in it."""
+    yield value
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list):
+        for inner in value:
+            yield from _values(inner)
 
 
 def _check_head(descriptor: Descriptor, head: Head, path: str | Path) -> None:
