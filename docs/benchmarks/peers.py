@@ -5,8 +5,9 @@
     python -m docs.benchmarks.peers adrenals FOLDER CACHE METHODS
     python -m docs.benchmarks.peers held_out ROOT CACHE METHODS
 
-METHODS is a list such as [numbers,fit]. All get the same bodies to train on, and the same to be tested on. Networks
-have one size, one rate and one number of steps, set before the first run.
+METHODS is a list such as [numbers,fit]. `--runs.seeds [200]` and the like choose fewer runs. All get the same bodies to
+train on, and the same to be tested on. Networks have one size, one rate and one number of steps, set before the first
+run.
 """
 
 from __future__ import annotations
@@ -307,13 +308,19 @@ def report(title: str, rows: list[dict[str, float]]) -> None:
     print(f"{title}, {len(rows)} runs: {', '.join(texts)}", flush=True)
 
 
-def run_adrenals(
-    root: Path,
-    cache_dir: Path,
-    methods: list[str],
-    seeds: tuple[int, ...] = SEEDS,
-    n_steps: int = N_STEPS,
-) -> None:
+@dataclass(frozen=True)
+class Runs:
+    """How often each method is trained: by seed and, where it varies, by number of labels of each class."""
+
+    seeds: tuple[int, ...] = SEEDS
+    labels: tuple[int, ...] = N_LABELS
+    n_steps: int = N_STEPS
+
+
+ALL_RUNS = Runs()
+
+
+def run_adrenals(root: Path, cache_dir: Path, methods: list[str], runs: Runs = ALL_RUNS) -> None:
     """Train on `train`, and print scores on `val`."""
     torch.set_num_threads(1)
     paths = sorted(root.glob("*/*/*.nii.gz"))
@@ -321,22 +328,21 @@ def run_adrenals(
     dataset = _dataset(paths, cache_dir, methods, labels)
     train = [i for i, path in enumerate(paths) if path.parts[-3] == "train"]
     test = [i for i, path in enumerate(paths) if path.parts[-3] == "val"]
-    task = Task(dataset, train, test, n_steps)
+    task = Task(dataset, train, test, runs.n_steps)
     for name in methods:
         rows = []
-        for seed in seeds:
+        for seed in runs.seeds:
             found, seconds = ask(name, task, seed)
             rows.append(scores(found, task) | {"seconds": seconds})
-            report(f"adrenals, {name}, {n_steps} steps", rows)
+            report(f"adrenals, {name}, {runs.n_steps} steps", rows)
 
 
 def run_held_out(
     root: Path,
     cache_dir: Path,
     methods: list[str],
-    seeds: tuple[int, ...] = SEEDS,
+    runs: Runs = ALL_RUNS,
     n_folds: int | None = None,
-    n_steps: int = N_STEPS,
 ) -> None:
     """Ask for each body of a folder after training on other folds, by default on all others, and print scores."""
     torch.set_num_threads(1)
@@ -345,64 +351,49 @@ def run_held_out(
     everyone = Task(dataset, [], list(range(len(dataset))))
     for name in methods:
         rows = []
-        for seed in seeds:
+        for seed in runs.seeds:
             folds = KFold(len(dataset))
             if n_folds is not None:
                 folds = StratifiedKFold(n_folds, shuffle=True, random_state=seed)
             answers = torch.zeros(len(dataset), len(dataset.classes))
             costs = []
             for train, test in folds.split(labels, labels):
-                task = Task(dataset, train.tolist(), test.tolist(), n_steps)
+                task = Task(dataset, train.tolist(), test.tolist(), runs.n_steps)
                 found, seconds = ask(name, task, seed)
                 answers[test] = found.float()
                 costs.append(seconds)
             rows.append(scores(answers, everyone) | {"seconds of a fit": mean(costs)})
-            report(f"{name}, {n_folds or len(dataset)} folds, {n_steps} steps", rows)
+            report(f"{name}, {n_folds or len(dataset)} folds, {runs.n_steps} steps", rows)
 
 
-def run_families(
-    folder: Path,
-    methods: list[str],
-    seeds: tuple[int, ...] = SEEDS,
-    labels: tuple[int, ...] = N_LABELS,
-    n_steps: int = N_STEPS,
-) -> None:
+def run_families(folder: Path, methods: list[str], runs: Runs = ALL_RUNS) -> None:
     """Train on a few bodies of each family, and print how many of two other bodies in two poses are recognised."""
     torch.set_num_threads(1)
     dataset = families(folder, *_described())
-    _few_labels(dataset, split_families, methods, seeds, labels, n_steps)
+    _few_labels(dataset, split_families, methods, runs)
 
 
-def run_collection(
-    root: Path,
-    cache_dir: Path,
-    methods: list[str],
-    seeds: tuple[int, ...] = SEEDS,
-    labels: tuple[int, ...] = N_LABELS,
-    n_steps: int = N_STEPS,
-) -> None:
+def run_collection(root: Path, cache_dir: Path, methods: list[str], runs: Runs = ALL_RUNS) -> None:
     """Train on a few bodies of each class, and print how many of those beyond ten of a class are recognised."""
     torch.set_num_threads(1)
     dataset = _dataset(root, cache_dir, methods)
-    _few_labels(dataset, split_classes, methods, seeds, labels, n_steps)
+    _few_labels(dataset, split_classes, methods, runs)
 
 
 def _few_labels(
     dataset: igps.SignatureDataset,
     split: Callable[[igps.SignatureDataset, int, int], tuple[list[int], list[int]]],
     methods: list[str],
-    seeds: tuple[int, ...],
-    labels: tuple[int, ...],
-    n_steps: int,
+    runs: Runs,
 ) -> None:
     for name in methods:
-        for n_labels in labels:
+        for n_labels in runs.labels:
             rows = []
-            for seed in seeds:
-                task = Task(dataset, *split(dataset, n_labels, seed), n_steps)
+            for seed in runs.seeds:
+                task = Task(dataset, *split(dataset, n_labels, seed), runs.n_steps)
                 found, seconds = ask(name, task, seed)
                 rows.append(scores(found, task) | {"seconds": seconds})
-            report(f"{name}, {n_labels} labels, {n_steps} steps", rows)
+            report(f"{name}, {n_labels} labels, {runs.n_steps} steps", rows)
 
 
 def split_families(
