@@ -35,8 +35,8 @@ def compare(
 
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
-        descriptors: names, or package.module:NAME of your own descriptors; by default all of the library, as in
-            igps help descriptors. If a name ends in +size, --size auto adds +size to no other name.
+        descriptors: names, or package.module:NAME of your own descriptors; by default all of igps help
+            descriptors that describe any body. If a name ends in +size, --size auto adds +size to no other name.
         out: folder for compare.json, distances/NAME.npz, precision_recall.png, meshes.json with the paths of the
             meshes, and failures.csv if there are failures.
         report: also write a page of results to the folder of --out, report.html, see igps report

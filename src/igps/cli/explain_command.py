@@ -38,7 +38,7 @@ def explain(
     """Show where two bodies or two groups of bodies differ, by the share of each part in their distance.
 
     Args:
-        meshes: two files, or a folder with two groups.
+        meshes: two files; or a folder with two groups, or, with --axis, without groups.
         descriptor: a descriptor made of histograms, such as interior, rich or pretrained.
         group: column of labels.csv that holds the groups of a folder; the class if not given.
         body: of a folder, only the bodies of this name in their files, such as an organ.

@@ -42,8 +42,8 @@ def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:
 
 _LOAD_HELP = {
     "mend": (
-        "auto repairs a surface as little as possible; never refuses a surface that bounds no body; "
-        "always makes watertight what crosses itself or does not bound a single body"
+        "auto: repair a surface as little as possible; never: refuse a surface that bounds no body; "
+        "always: make watertight what crosses itself or does not bound a single body"
     ),
     "allow_open": "accept surfaces with holes; the winding number then tells inside from outside",
     "bodies": (
@@ -95,8 +95,7 @@ _COLLECTION = (
         "attribute",
         list[str],
         "values inside the bodies, such as ct=images/{stem}.nii.gz: a file below the folder with an "
-        "image, a grid, or values at vertices or in tetrahedra; {stem}, {file} and {part} are replaced "
-        "by those of each body",
+        "image, a grid, or values at vertices; {stem}, {file} and {part} are replaced by those of each body",
     ),
     Option("cache_dir", Path, "folder of the cache; by default the user's cache directory"),
 )
