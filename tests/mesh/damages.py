@@ -135,7 +135,7 @@ DAMAGES = {
 def _with_holes(vertices, faces, generator):
     area = face_areas(vertices, faces)
     per_patch = _MISSING / _N_PATCHES * area.sum()
-    pairs, _ = undirected_edges(faces, len(vertices))
+    pairs, _ = undirected_edges(faces)
     length = np.linalg.norm(
         vertices[pairs[:, 0]] - vertices[pairs[:, 1]],
         axis=1,

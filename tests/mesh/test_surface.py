@@ -61,8 +61,7 @@ def test_a_neighbour_in_the_same_place_is_the_mean(blob):
 
 
 def test_edges(blob):
-    n_vertices = len(blob.vertices)
-    edges, edge_of = surface.undirected_edges(blob.faces, n_vertices)
+    edges, edge_of = surface.undirected_edges(blob.faces)
     sides = [(int(face[i]), int(face[(i + 1) % 3])) for face in blob.faces for i in range(3)]
     start, end = surface.directed_edges(blob.faces)
     assert np.column_stack([start, end]).tolist() == [list(side) for side in sides]

@@ -128,7 +128,7 @@ class TriangleSurface:
     @cached_property
     def _play(self) -> Floats:
         vertices, faces = self._triangles
-        edges, edge_of_side = undirected_edges(faces, len(vertices))
+        edges, edge_of_side = undirected_edges(faces)
         lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
         count = np.bincount(edge_of_side, minlength=len(edges))
         sides = np.argsort(edge_of_side, kind="stable")

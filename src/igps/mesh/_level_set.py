@@ -1,7 +1,7 @@
 """Compute the signed distances of grid points to the surface of one body, negative inside. Lengths are in cells."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -11,7 +11,7 @@ from scipy import ndimage, sparse
 
 from igps._arrays import Booleans, Floats, Integers, Singles
 from igps.mesh._outside import MARGIN, WALL, OrientedSurface
-from igps.mesh.surface import face_areas
+from igps.mesh.surface import box_sides, face_areas
 
 # Maximal exact distance: marching cubes need distances at both ends of the grid edges that cross the surface.
 _BAND = 1.1
@@ -55,14 +55,16 @@ def cell_sizes(
     With the minimal size the grid has about as many cells, in all and on the surface, as a cube of side `resolution`.
     With the default size it has at most 2 * `resolution` cells along the longest side.
     """
-    corners = vertices[faces]
-    sides = np.ptp(corners.reshape(-1, 3), axis=0)
+    corners = vertices[faces].reshape(-1, 3)
+    sides = box_sides(corners)
     longest = float(sides.max())
-    area = float(face_areas(vertices, faces).sum())
-    volume = float(np.prod(np.maximum(sides, longest / 1000)))
+    thick_sides = np.maximum(sides, longest / 1000)
+    volume = float(np.prod(thick_sides))
     by_volume = volume ** (1 / 3) / resolution
-    by_area = float(np.sqrt(area / (6 * resolution**2)))
-    min_size = min(max(by_volume, by_area), longest / (0.8 * resolution))
+    area = float(face_areas(vertices, faces).sum())
+    by_area = math.sqrt(area / (6 * resolution**2))
+    min_size = max(by_volume, by_area)
+    min_size = min(min_size, longest / (0.8 * resolution))
     min_size = max(min_size, spacing)
     default_size = max(min_size, longest / (2 * resolution))
     return default_size, min_size
@@ -76,24 +78,30 @@ def distances(
 
     vertices = np.asfortranarray(vertices)
     faces = np.asfortranarray(faces)
+
+    def nearest_to(points: NDArray[Any]) -> tuple[Floats, Floats]:
+        """Return the squared distances (P,) of points (P, 3), and their nearest surface points (P, 3)."""
+        points = np.asfortranarray(points, dtype=np.float64)
+        squared, _, feet = igl.point_mesh_squared_distance(points, vertices, faces)
+        return squared, feet
+
     size = 8  # blocks that may be near the surface are halved until they are single grid points
     blocks = _all_combinations([np.arange(0, n, size) for n in shape])
     while size > 1:
-        centre = np.asfortranarray(blocks + (size - 1) / 2)
-        squared, _, _ = igl.point_mesh_squared_distance(centre, vertices, faces)
-        near = np.sqrt(squared) <= (size - 1) / 2 * np.sqrt(3) + _BAND
+        to_centre = (size - 1) / 2
+        squared, _ = nearest_to(blocks + to_centre)
+        near = np.sqrt(squared) <= to_centre * np.sqrt(3) + _BAND
         size //= 2
-        corner = size * _all_combinations([np.arange(2)] * 3)
-        blocks = (blocks[near][:, None] + corner).reshape(-1, 3)
+        halves = size * _all_combinations([np.arange(2)] * 3)
+        blocks = (blocks[near][:, None] + halves).reshape(-1, 3)
         blocks = blocks[(blocks < shape).all(axis=1)]
-    points = np.asfortranarray(blocks.astype(np.float64))
-    squared, _, point = igl.point_mesh_squared_distance(points, vertices, faces)
+    squared, feet = nearest_to(blocks)
     distance = np.full(shape, np.inf, dtype=np.float32)
     nearest = np.zeros((*shape, 3), dtype=np.float32)
     in_band = squared <= _BAND**2
     at = tuple(blocks[in_band].T)
     distance[at] = np.sqrt(squared[in_band])
-    nearest[at] = point[in_band]
+    nearest[at] = feet[in_band]
     return distance, nearest
 
 
@@ -107,56 +115,72 @@ def level_set(
     distance: Singles, nearest: Singles, outside: Booleans, surface: OrientedSurface
 ) -> Singles:
     """Return the signed distance to the surface; sheets, which enclose nothing, get about a cell of thickness."""
-    from skimage.segmentation import watershed
-
-    band = np.isfinite(distance)
-    wall = distance <= WALL
-    at = np.nonzero(band)
-    foot = nearest[at]
-    height = distance[at]
-    length = np.maximum(height, 1e-6)
-    normal = (np.stack(at, axis=1) - foot) / length[:, None]
-    # A wall point belongs to the side beyond it, away from the surface; if only wall lies beyond, to the side of its
-    # deepest neighbours.
-    sides = np.where(outside, 1, 2)
-    markers = np.where(wall, 0, sides).astype(np.int32)
-    undecided = np.nonzero(height <= WALL)[0]
-    for step in (0.75, 1.0, 1.25):
-        side = _nearest_values(markers, foot[undecided] + step * normal[undecided])
-        decided = undecided[side > 0]
-        markers[tuple(index[decided] for index in at)] = side[side > 0]
-        undecided = undecided[side == 0]
-    markers = watershed(-np.where(band, distance, _BAND), markers, connectivity=3)
-    inside = markers == 2
-    is_solid = _is_solid(inside, at, foot, normal)
+    # Grid points near the surface, by their numbers in the flattened grid
+    band = np.flatnonzero(np.isfinite(distance))
+    points = _points_at(band, distance.shape)
+    feet = nearest.reshape(-1, 3)[band]
+    heights = np.take(distance, band)
+    lengths = np.maximum(heights, 1e-6)
+    normals = (points - feet) / lengths[:, None]
+    inside = _inside(distance, outside, band, feet, normals)
+    is_solid = _is_solid(inside, band, feet, normals)
     if surface.is_nearly_closed and not is_solid.all():
         # A flood cannot find the inside of walls that are thinner than a cell; the winding number can.
-        thin = np.stack([index[~is_solid] for index in at], axis=1)
-        inside[tuple(thin[surface.winding(thin) > 0.5].T)] = True
-        is_solid = _is_solid(inside, at, foot, normal)
+        thin = band[~is_solid]
+        winding = surface.winding(_points_at(thin, distance.shape))
+        np.put(inside, thin[winding > 0.5], True)
+        is_solid = _is_solid(inside, band, feet, normals)
     # At least MIN_ABS_VALUE, because zero would have no sign.
     clipped = np.clip(distance, np.float32(MIN_ABS_VALUE), np.float32(_BAND))
     field = np.where(inside, -1, 1) * clipped
-    sheet = tuple(index[~is_solid] for index in at)
-    field[sheet] = distance[sheet] - _HALF_SHEET
+    sheet = band[~is_solid]
+    np.put(field, sheet, np.take(distance, sheet) - _HALF_SHEET)
     smallest = np.where(field < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE)
     field = np.where(np.abs(field) < MIN_ABS_VALUE, smallest, field)
     return fill_bubbles(field.astype(np.float32))
 
 
-def _is_solid(
-    inside: Booleans, at: tuple[Integers, ...], foot: NDArray[Any], normal: NDArray[Any]
+def _inside(
+    distance: Singles, outside: Booleans, band: Integers, feet: NDArray[Any], normals: NDArray[Any]
 ) -> Booleans:
-    """Return whether each grid point is inside, or has an inside behind its nearest surface point."""
-    is_solid = inside[at]
+    """Return which grid points are inside: those beyond the walls that the flood misses, and wall points beside them.
+
+    A wall point belongs to the side beyond it, away from the surface; if only wall lies beyond, to the side of its
+    deepest neighbours.
+    """
+    from skimage.segmentation import watershed
+
+    sides = np.where(outside, 1, 2)
+    sides = np.where(distance <= WALL, 0, sides).astype(np.int32)
+    undecided = np.flatnonzero(np.take(distance, band) <= WALL)
+    for step in (0.75, 1.0, 1.25):
+        beyond = _nearest_values(sides, feet[undecided] + step * normals[undecided])
+        is_decided = beyond > 0
+        np.put(sides, band[undecided[is_decided]], beyond[is_decided])
+        undecided = undecided[~is_decided]
+    depth = np.where(np.isfinite(distance), distance, _BAND)
+    return np.asarray(watershed(-depth, sides, connectivity=3) == 2)
+
+
+def _is_solid(
+    inside: Booleans, band: Integers, feet: NDArray[Any], normals: NDArray[Any]
+) -> Booleans:
+    """Return whether each point of the band is inside, or has an inside behind its nearest surface point."""
+    is_solid = np.take(inside, band)
     for step in (0.25, 0.5, 0.75, 1.0):
-        is_solid |= _nearest_values(inside, foot - step * normal)
-    return np.asarray(is_solid)
+        is_solid |= _nearest_values(inside, feet - step * normals)
+    return is_solid
+
+
+def _points_at(numbers: Integers, shape: tuple[int, ...]) -> Integers:
+    """Return the grid points (P, 3) with these numbers in the flattened grid."""
+    return np.stack(np.unravel_index(numbers, shape), axis=1)
 
 
 def _nearest_values(values: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
     last = np.array(values.shape) - 1
-    index = np.clip(np.round(points).astype(np.int64), 0, last)
+    index = np.round(points).astype(np.int64)
+    index = np.clip(index, 0, last)
     return np.asarray(values[tuple(index.T)])
 
 
@@ -175,58 +199,63 @@ def join_pieces(field: Singles, notes: list[str], radius: float = 0.0) -> Single
         return field
     volume = np.bincount(label.ravel(), minlength=count + 1)
     volume[0] = 0
-    specks = np.nonzero(volume < SPECK_VOLUME * volume.sum())[0][1:]
+    specks = np.flatnonzero(volume < SPECK_VOLUME * volume.sum())[1:]
     if len(specks) and volume[specks].sum() < 0.05 * volume.sum():
         is_dropped = np.isin(label, specks)
         field[is_dropped] = -field[is_dropped]
         label[is_dropped] = 0
-    pieces = np.unique(label)[1:]
-    if len(pieces) < 2:
+    n_pieces = len(np.unique(label)) - 1
+    if n_pieces < 2:
         return field
+    bar_radius = max(radius, _MIN_BAR_RADIUS)
+    for a, b in _narrowest_gaps(label):
+        _add_bar(field, a, b, bar_radius)
+    notes.append(f"joined {n_pieces} pieces by bars")
+    return fill_bubbles(field)
+
+
+def _narrowest_gaps(label: NDArray[np.int32]) -> Iterator[tuple[Floats, Floats]]:
+    """Yield the two ends (3,) of gaps between pieces, by their labels, that join them with the least total length."""
     # The width of a gap is measured where the regions touch that are nearest to either piece.
     distance, index = ndimage.distance_transform_edt(label == 0, return_indices=True)
     owner = label[tuple(index)]
     contacts = []
-    positions = np.arange(field.size).reshape(field.shape)
-    for axis in range(3):
-        a: list[slice] = [slice(None)] * 3
-        b: list[slice] = [slice(None)] * 3
-        a[axis] = slice(None, -1)
-        b[axis] = slice(1, None)
-        here = tuple(a)
-        there = tuple(b)
-        width = distance[here] + distance[there] + 1
-        pairs = (owner[here], owner[there], width, positions[here], positions[there])
-        is_contact = owner[here] != owner[there]
-        contacts.append([values[is_contact] for values in pairs])
-    i, j, width, p, q = (np.concatenate(values) for values in zip(*contacts, strict=True))
+    _, n_y, n_z = label.shape
+    for axis, step in enumerate((n_y * n_z, n_z, 1)):
+        borders = np.nonzero(np.diff(owner, axis=axis))
+        here = np.ravel_multi_index(borders, label.shape)
+        contacts.append((here, here + step))
+    start, end = np.concatenate(contacts, axis=1)
+    width = np.take(distance, start) + np.take(distance, end) + 1
+    n_labels = int(label.max()) + 1
+    first = np.take(owner, start).astype(np.int64)
+    second = np.take(owner, end).astype(np.int64)
+    pair = np.minimum(first, second) * n_labels + np.maximum(first, second)
     order = np.argsort(width, kind="stable")
-    smaller = np.minimum(i, j).astype(np.int64)
-    pair = smaller * (count + 1) + np.maximum(i, j)
     _, narrowest = np.unique(pair[order], return_index=True)
     chosen = order[narrowest]
-    ends = (i[chosen], j[chosen])
-    graph = sparse.csr_array((width[chosen], ends), shape=(count + 1,) * 2)
+    ends = (first[chosen], second[chosen])
+    graph = sparse.csr_array((width[chosen], ends), shape=(n_labels, n_labels))
     tree = sparse.csgraph.minimum_spanning_tree(graph).tocoo()
-    lookup = {(int(i[k]), int(j[k])): k for k in chosen}
+    contact_of = {(int(first[k]), int(second[k])): k for k in chosen}
     nearest = index.reshape(3, -1).astype(np.float64)
-    bar_radius = max(radius, _MIN_BAR_RADIUS)
     for link in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
-        k = lookup[link]
-        _add_bar(field, nearest[:, p[k]], nearest[:, q[k]], bar_radius)
-    notes.append(f"joined {len(pieces)} pieces by bars")
-    return fill_bubbles(field)
+        contact = contact_of[link]
+        yield nearest[:, start[contact]], nearest[:, end[contact]]
 
 
 def _add_bar(field: Singles, a: Floats, b: Floats, radius: float) -> None:
-    around = math.ceil(radius) + 1
-    low = np.maximum(np.minimum(a, b).astype(int) - around, 0)
-    above = np.maximum(a, b).astype(int) + around + 1
-    high = np.minimum(above, field.shape)
+    margin = math.ceil(radius) + 1
+    first = np.minimum(a, b).astype(int)
+    last = np.maximum(a, b).astype(int)
+    low = np.maximum(first - margin, 0)
+    high = np.minimum(last + margin + 1, field.shape)
     box = tuple(map(slice, low, high))
-    from_a = np.moveaxis(np.indices(high - low), 0, -1) + low - a
+    points = np.moveaxis(np.indices(high - low), 0, -1)
+    from_a = points + low - a
     axis = b - a
     squared_length = max(float(axis @ axis), 1e-9)
     along = np.clip(from_a @ axis / squared_length, 0, 1)
-    distance = np.linalg.norm(from_a - along[..., None] * axis, axis=-1)
+    nearest = along[..., None] * axis
+    distance = np.linalg.norm(from_a - nearest, axis=-1)
     field[box] = np.minimum(field[box], distance - radius)

@@ -11,6 +11,7 @@ wall, stays open at any width of the mouth: the winding number behind is near ze
 always closed.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers, Singles
-from igps.mesh.surface import area_vectors, face_areas, signed_volume
+from igps.mesh.surface import area_vectors, face_areas, has_twins, lengths, signed_volume
 
 MARGIN = 3  # cells around the bounding box of the surface
 # Grid points this close to a triangle are wall, which the flood does not enter. A grid line that crosses a triangle has
@@ -49,9 +50,7 @@ class OrientedSurface:
         _, first, index = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
         vertices = vertices[first]
         faces = index.ravel()[faces]
-        steps = np.diff(np.sort(faces, axis=1), axis=1)
-        has_three_corners = (steps > 0).all(axis=1)
-        faces = faces[has_three_corners]
+        faces = faces[~has_twins(faces)]
         if not len(faces):
             return cls(vertices, faces, False)
         faces, part = igl.bfs_orient(faces)
@@ -60,8 +59,11 @@ class OrientedSurface:
         if signed_volume(vertices, faces) < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
         surface = cls(vertices, faces, False)
-        defect = _defect(surface.winding(_probe_points(vertices, faces)))
-        return replace(surface, is_nearly_closed=defect < _NEARLY_CLOSED)
+        winding = surface.winding(_probe_points(vertices, faces))
+        # Beside closed, outward oriented surfaces the numbers are 0, 1, 2, ...
+        nearest = np.maximum(np.round(winding), 0)
+        defect = np.abs(winding - nearest).mean()
+        return replace(surface, is_nearly_closed=bool(defect < _NEARLY_CLOSED))
 
     @property
     def thickness(self) -> float:
@@ -84,19 +86,14 @@ class OrientedSurface:
 def _probe_points(vertices: Floats, faces: Integers) -> Floats:
     """Return points on the outer, then on the inner side of the centroids of faces chosen evenly by area."""
     normals = area_vectors(vertices, faces)
-    area = np.linalg.norm(normals, axis=1)
-    at = (np.arange(_N_PROBES) + 0.5) / _N_PROBES * area.sum()
-    face = np.minimum(np.searchsorted(np.cumsum(area), at), len(area) - 1)
-    face = face[area[face] > 0]
-    middle = vertices[faces[face]].mean(axis=1)
-    step = 0.25 * (normals[face] / area[face, None])
+    areas = lengths(normals)
+    at = (np.arange(_N_PROBES) + 0.5) / _N_PROBES * areas.sum()
+    chosen = np.searchsorted(np.cumsum(areas), at)
+    chosen = np.minimum(chosen, len(areas) - 1)
+    chosen = chosen[areas[chosen] > 0]
+    middle = vertices[faces[chosen]].mean(axis=1)
+    step = 0.25 * (normals[chosen] / areas[chosen, None])
     return np.concatenate([middle + step, middle - step])
-
-
-def _defect(winding: Floats) -> float:
-    """Return the mean distance to the nearest of 0, 1, 2, ...: zero beside closed, outward oriented surfaces."""
-    nearest = np.maximum(np.round(winding), 0)
-    return float(np.abs(winding - nearest).mean())
 
 
 def find_outside(distance: Singles, surface: OrientedSurface) -> tuple[Booleans, int]:
@@ -114,7 +111,8 @@ def find_outside(distance: Singles, surface: OrientedSurface) -> tuple[Booleans,
     # Both sides spread in the order of the distance to the wall, so that they meet at the narrowest place.
     depth = ndimage.distance_transform_edt(outside)
     markers = np.ones(outside.shape, dtype=np.int64)
-    markers[1:-1, 1:-1, 1:-1] = np.where(cavities, 2, 0)[1:-1, 1:-1, 1:-1]
+    within = (slice(1, -1),) * 3
+    markers[within] = np.where(cavities[within], 2, 0)
     return watershed(-depth, markers, mask=outside) == 1, count
 
 
@@ -123,7 +121,8 @@ def _outside_by_winding(
 ) -> tuple[Booleans, int]:
     near = np.argwhere(outside & np.isfinite(distance))
     # A third of the points beside the surface suffices to see whether the flood entered anywhere.
-    probe = near[near.sum(axis=1) % 3 == 0]
+    is_probed = near.sum(axis=1) % 3 == 0
+    probe = near[is_probed]
     leaked = probe[surface.winding(probe) > 0.5]
     if not len(leaked):
         return outside, 0
@@ -132,12 +131,13 @@ def _outside_by_winding(
     high = np.minimum(leaked.max(axis=0) + 5, outside.shape)
     box = tuple(map(slice, low, high))
     points = np.argwhere(outside[box]) + low
-    inside = np.zeros_like(outside)
     # Where a base is missing, winding numbers are large beyond the bounding box, too, but no body reaches there.
     end = np.array(outside.shape) - MARGIN
     is_in_box = ((points >= MARGIN) & (points < end)).all(axis=1)
     points = points[is_in_box]
-    inside[tuple(points[surface.winding(points) > 0.5].T)] = True
+    points = points[surface.winding(points) > 0.5]
+    inside = np.zeros_like(outside)
+    inside[tuple(points.T)] = True
     _, count = ndimage.label(inside, structure=np.ones((3, 3, 3)))
     return outside & ~inside, count
 
@@ -148,18 +148,23 @@ def _cavities(outside: Booleans, surface: OrientedSurface) -> Booleans:
     cavities = np.zeros_like(outside)
     radius = 1.0
     while radius < depth.max() * _MOUTH:
-        # Everything around the grid is outside.
-        label, count = ndimage.label(np.pad(depth > radius, 1, constant_values=True))
-        if count > 1:
-            open_label = label[0, 0, 0]
-            label = label[1:-1, 1:-1, 1:-1]
-            peak = ndimage.maximum(depth, label, np.arange(count + 1))
-            for k in np.nonzero(peak * _MOUTH >= radius)[0]:
-                if k in (0, open_label):
-                    continue
-                core = label == k
-                middle = np.argwhere(core & (depth >= peak[k] - 1e-9))[:8]
-                if np.median(surface.winding(middle)) >= _TWO_SIDED:
-                    cavities |= core
+        for core, peak in _closed_spaces(depth, radius):
+            deepest = np.argwhere(core & (depth >= peak - 1e-9))[:8]
+            if np.median(surface.winding(deepest)) >= _TWO_SIDED:
+                cavities |= core
         radius *= 1.3
     return cavities
+
+
+def _closed_spaces(depth: Floats, radius: float) -> Iterator[tuple[Booleans, float]]:
+    """Yield the cores deeper than the radius, and the depth, of spaces that no mouth of this radius opens."""
+    # Everything around the grid is outside.
+    label, count = ndimage.label(np.pad(depth > radius, 1, constant_values=True))
+    if count == 1:
+        return
+    open_label = label[0, 0, 0]
+    label = label[1:-1, 1:-1, 1:-1]
+    peaks = ndimage.maximum(depth, label, np.arange(count + 1))
+    for k in range(1, count + 1):
+        if k != open_label and peaks[k] * _MOUTH >= radius:
+            yield label == k, peaks[k]

@@ -4,7 +4,6 @@ from collections import defaultdict
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay, cKDTree
 
@@ -13,11 +12,16 @@ from igps._text import counted
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import (
+    TINY,
     compact,
     diagonal,
     directed_edges,
     face_areas,
     face_parts,
+    faces_at_sides,
+    has_twins,
+    lengths,
+    linked,
     signed_volume,
     undirected_edges,
 )
@@ -46,16 +50,18 @@ def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     vertices, faces = compact(vertices, faces)
     n_unused = n_before - len(vertices)
     place = places(vertices)
-    place = _close_cracks(vertices, place[faces])[place]
+    without_cracks = _close_cracks(vertices, place[faces])
+    place = without_cracks[place]
     n_places = len(np.unique(place))
     if n_places < len(vertices):
         notes.append(f"welded {counted(len(vertices) - n_places, 'coincident vertex')}")
         faces = place[faces]
-    is_degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    is_degenerate = has_twins(faces)
     if is_degenerate.any():
         notes.append(f"dropped {counted(int(is_degenerate.sum()), 'degenerate face')}")
         faces = faces[~is_degenerate]
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    sorted_corners = np.sort(faces, axis=1)
+    _, first = np.unique(sorted_corners, axis=0, return_index=True)
     if len(first) < len(faces):
         notes.append(f"dropped {counted(len(faces) - len(first), 'duplicate face')}")
         faces = faces[np.sort(first)]
@@ -68,7 +74,7 @@ def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
 
 def places(vertices: Floats) -> Integers:
     """Return, for each vertex (V,), the index of the first vertex at the same place, up to a tolerance."""
-    size = max(diagonal(vertices), np.finfo(float).tiny)
+    size = max(diagonal(vertices), TINY)
     centred = vertices - vertices.mean(axis=0)
     lattice = np.round(centred / (_WELD * size)).astype(np.int64)
     _, first, index = np.unique(lattice, axis=0, return_index=True, return_inverse=True)
@@ -77,32 +83,26 @@ def places(vertices: Floats) -> Integers:
 
 def _close_cracks(vertices: Floats, faces: Integers) -> Integers:
     """Return, for each vertex (V,), the vertex into which it is merged to close cracks between boundaries."""
-    boundary = _boundary_vertices(vertices, faces)
+    start, end = directed_edges(faces)
+    is_boundary = faces_at_sides(faces).ravel() == 1
+    boundary = np.union1d(start[is_boundary], end[is_boundary])
     index = np.arange(len(vertices))
     tree = cKDTree(vertices[boundary])
     width = _CRACK * diagonal(vertices)
     if tree.count_neighbors(tree, width) > _MAX_CRACK_NEIGHBOURS * len(boundary):
         return index
-    pairs = tree.query_pairs(width, output_type="ndarray")
-    ones = np.ones(len(pairs), dtype=np.int8)
-    n = len(boundary)
-    graph = sparse.coo_array((ones, tuple(pairs.T)), shape=(n, n))
-    _, component = connected_components(graph, directed=False)
-    _, first, group = np.unique(component, return_index=True, return_inverse=True)
+    start, end = tree.query_pairs(width, output_type="ndarray").T
+    _, group = linked(start, end, len(boundary))
+    _, first = np.unique(group, return_index=True)
     index[boundary] = boundary[first[group]]
     return index
 
 
-def _boundary_vertices(vertices: Floats, faces: Integers) -> Integers:
-    edges, edge_of_side = undirected_edges(faces, len(vertices))
-    n_faces = np.bincount(edge_of_side, minlength=len(edges))
-    return np.unique(edges[n_faces == 1])
-
-
 def are_specks(areas: Floats) -> Booleans:
     """Return which parts are specks, given their areas; none are if all of them together have much area."""
-    is_speck = areas < SPECK * areas.sum()
-    return is_speck & (areas[is_speck].sum() < 10 * SPECK * areas.sum())
+    limit = SPECK * areas.sum()
+    is_speck = areas < limit
+    return is_speck & (areas[is_speck].sum() < 10 * limit)
 
 
 def orient(faces: Integers, notes: list[str]) -> Integers:
@@ -142,8 +142,7 @@ def _drop_fins(vertices: Floats, faces: Integers) -> Integers:
     """Drop fins: faces with a boundary edge and an edge that two other faces share. Keep all if fins have much area."""
     remaining = faces
     while len(remaining):
-        _, edge_of_side = undirected_edges(remaining, len(vertices))
-        n_faces = np.bincount(edge_of_side)[edge_of_side].reshape(-1, 3)
+        n_faces = faces_at_sides(remaining)
         is_free = (n_faces == 1).any(axis=1)
         is_crowded = (n_faces > 2).any(axis=1)
         is_fin = is_free & is_crowded
@@ -172,7 +171,7 @@ def drop_hidden_parts(
         return vertices, faces
     others = np.unique(faces[part != largest])
     is_inside = np.zeros(len(vertices), dtype=bool)
-    is_inside[others] = winding_number(body.vertices, body.faces, vertices[others]) > 0.5
+    is_inside[others] = _are_inside(body, vertices[others])
     reaches_out = ~is_inside[faces].all(axis=1)
     is_hidden = np.bincount(part, weights=reaches_out, minlength=len(areas)) == 0
     if not is_hidden.any():
@@ -183,9 +182,10 @@ def drop_hidden_parts(
         faces = faces.copy()
         for k in _cavities_among(vertices, faces, part, np.flatnonzero(is_hidden), areas):
             is_hidden[k] = False
-            if outer_sign * signed_volume(*compact(vertices, faces[part == k])) > 0:
+            hollow = faces[part == k]
+            if outer_sign * signed_volume(*compact(vertices, hollow)) > 0:
                 notes.append("turned the surface of a cavity towards the inside")
-                faces[part == k] = faces[part == k][:, ::-1]
+                faces[part == k] = hollow[:, ::-1]
     if is_hidden.any():
         notes.append(f"dropped {counted(int(is_hidden.sum()), 'part')} hidden inside")
     return compact(vertices, faces[~is_hidden[part]])
@@ -202,15 +202,15 @@ def _cavities_among(
             hollow = Mesh(*compact(vertices, faces[part == k]))
         except MeshError:
             continue
-        if any(_has_inside(other, hollow.vertices) for other in hollows):
+        if any(_are_inside(other, hollow.vertices).any() for other in hollows):
             continue
         hollows.append(hollow)
         found.append(k)
     return found
 
 
-def _has_inside(body: Mesh, points: Floats) -> bool:
-    return bool((winding_number(body.vertices, body.faces, points) > 0.5).any())
+def _are_inside(body: Mesh, points: Floats) -> Booleans:
+    return winding_number(body.vertices, body.faces, points) > 0.5
 
 
 def fill_small_holes(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
@@ -220,7 +220,7 @@ def fill_small_holes(vertices: Floats, faces: Integers, notes: list[str]) -> Sur
     n_filled = 0
     for loop in _boundary_loops(faces):
         rim = vertices[loop]
-        length = np.linalg.norm(rim - np.roll(rim, -1, axis=0), axis=1).sum()
+        length = lengths(rim - np.roll(rim, -1, axis=0)).sum()
         area_of_circle = length**2 / (4 * np.pi)
         area_of_part = areas[part_of_vertex[loop[0]]]
         if area_of_circle <= _SMALL_HOLE * area_of_part:
@@ -249,21 +249,23 @@ def _boundary_loops(faces: Integers) -> list[Integers]:
     that form no loop are left out.
     """
     end, start = directed_edges(faces)
-    _, edge_of_side = undirected_edges(faces, int(faces.max(initial=-1)) + 1)
-    free = np.nonzero(np.bincount(edge_of_side)[edge_of_side] == 1)[0]
+    n_faces = faces_at_sides(faces)
+    free = np.flatnonzero(n_faces == 1)
+    starts = start[free].tolist()
     forward = defaultdict(list)
     backward = defaultdict(list)
-    for edge, a, b in zip(free.tolist(), start[free].tolist(), end[free].tolist(), strict=True):
+    for edge, (a, b) in enumerate(zip(starts, end[free].tolist(), strict=True)):
         forward[a].append((edge, b))
         backward[b].append((edge, a))
     visited: set[int] = set()
     loops = []
-    for first in start[free].tolist():
+    for first in starts:
         path = [first]
         position = {first: 0}
-        while path:
-            steps = [*forward[path[-1]], *backward[path[-1]]]
-            edge, vertex = next((step for step in steps if step[0] not in visited), (-1, -1))
+        while True:
+            here = path[-1]
+            steps = (step for step in forward[here] + backward[here] if step[0] not in visited)
+            edge, vertex = next(steps, (-1, -1))
             if edge < 0:  # back at the start, or a dead end
                 break
             visited.add(edge)
@@ -276,7 +278,7 @@ def _boundary_loops(faces: Integers) -> list[Integers]:
                 loops.append(np.array(loop))
             for old in loop[1:]:
                 del position[old]
-            del path[position[vertex] + 1 :]
+                path.pop()
     return loops
 
 
@@ -295,21 +297,21 @@ def _span(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
     if n == 3:
         return vertices, np.vstack([faces, loop[None]])
     rim = vertices[loop]
-    along = np.cumsum(np.linalg.norm(rim - np.roll(rim, 1, axis=0), axis=1))
+    sides = lengths(rim - np.roll(rim, 1, axis=0))
+    along = np.cumsum(sides)
     n_rings = max(round(n / (2 * np.pi)), 1)
     disc = [_circle(along / along[-1], 1.0)]
     for ring in range(1, n_rings):
         radius = 1 - ring / n_rings
         size = max(round(n * radius), 3)
-        disc.append(_circle((np.arange(size) + ring / 2) / size, radius))
+        turns = (np.arange(size) + ring / 2) / size
+        disc.append(_circle(turns, radius))
     disc.append(np.zeros((1, 2)))
     plane = np.concatenate(disc)
     patch = Delaunay(plane).simplices.astype(np.int64)  # counter-clockwise, like the loop
-    n_new = len(plane) - n
-    points = np.vstack([rim, np.zeros((n_new, 3))])
-    points[n:] = _solve_umbrella(points, patch, n, order=1)
-    index = np.concatenate([loop, len(vertices) + np.arange(n_new)])
-    return np.vstack([vertices, points[n:]]), np.vstack([faces, index[patch]])
+    film = _solve_umbrella(rim, patch, len(plane), order=1)
+    index = np.append(loop, len(vertices) + np.arange(len(film)))
+    return np.vstack([vertices, film]), np.vstack([faces, index[patch]])
 
 
 def _circle(turns: Floats, radius: float) -> Floats:
@@ -317,28 +319,30 @@ def _circle(turns: Floats, radius: float) -> Floats:
     return radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
-def _solve_umbrella(points: Floats, faces: Integers, n_fixed: int, order: int) -> Floats:
-    """Return the points after the first `n_fixed`, placed so that the umbrella operator to the power `order` is 0."""
-    edges, _ = undirected_edges(faces, len(points))
-    size = len(points)
-    ends = (edges.T.ravel(), edges[:, ::-1].T.ravel())
-    graph = sparse.coo_array((np.ones(2 * len(edges)), ends), shape=(size, size)).tocsr()
-    umbrella = sparse.eye_array(size) - sparse.diags_array(1 / graph.sum(axis=1)) @ graph
+def _solve_umbrella(fixed: Floats, faces: Integers, n_points: int, order: int) -> Floats:
+    """Return the points after the fixed ones, placed so that the umbrella operator to the power `order` is 0."""
+    edges, _ = undirected_edges(faces)
+    ends = np.concatenate([edges, edges[:, ::-1]]).T
+    shape = (n_points, n_points)
+    graph = sparse.coo_array((np.ones(2 * len(edges)), tuple(ends)), shape=shape).tocsr()
+    averaging = sparse.diags_array(1 / graph.sum(axis=1)) @ graph
+    umbrella = sparse.eye_array(n_points) - averaging
     if order == 2:
         umbrella = umbrella @ umbrella
+    n_fixed = len(fixed)
     operator = umbrella.tocsr()[n_fixed:]
     of_free = operator[:, n_fixed:].tocsc()
-    of_fixed = operator[:, :n_fixed] @ points[:n_fixed]
+    of_fixed = operator[:, :n_fixed] @ fixed
     solved = spsolve(of_free, -of_fixed)
     return np.asarray(solved).reshape(-1, 3)
 
 
 def _fair(vertices: Floats, faces: Integers, n_old: int) -> Floats:
     """Move the vertices from `n_old` on so that the surface continues smoothly across the rim, like a thin plate."""
-    ring = np.unique(faces[(faces >= n_old).any(axis=1)])
-    near = faces[np.isin(faces, ring).any(axis=1)]
-    near = faces[np.isin(faces, np.unique(near)).any(axis=1)]
-    used = np.unique(near)
-    n_fixed = int((used < n_old).sum())
-    free = _solve_umbrella(vertices[used], np.searchsorted(used, near), n_fixed, order=2)
+    near = faces[(faces >= n_old).any(axis=1)]
+    for _ in range(2):
+        near = faces[np.isin(faces, near).any(axis=1)]
+    used, index = np.unique(near, return_inverse=True)
+    fixed = vertices[used[used < n_old]]
+    free = _solve_umbrella(fixed, index.reshape(-1, 3), len(used), order=2)
     return np.concatenate([vertices[:n_old], free])

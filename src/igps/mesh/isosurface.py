@@ -9,7 +9,9 @@ from igps.mesh.errors import MeshError
 from igps.mesh.surface import (
     directed_edges,
     dots,
+    edge_keys,
     face_areas,
+    lengths,
     signed_volume,
     vertex_normals,
 )
@@ -35,11 +37,11 @@ def level_surface(field: Singles, name: str) -> Surface:
         if not len(bad_edges):
             return vertices.astype(np.float64), faces
         # Fill the four or eight grid points around each vertex at which the surface meets itself.
-        for vertex in np.unique(bad_edges):
-            low = np.maximum(np.floor(vertices[vertex]).astype(int), 1)
-            high = np.ceil(vertices[vertex]).astype(int) + 1
-            end = np.minimum(high, np.array(field.shape) - 1)
-            box = tuple(map(slice, low, end))
+        last = np.array(field.shape) - 1
+        for place in vertices[np.unique(bad_edges)]:
+            low = np.maximum(np.floor(place).astype(int), 1)
+            high = np.minimum(np.ceil(place).astype(int) + 1, last)
+            box = tuple(map(slice, low, high))
             field[box] = np.minimum(field[box], -MIN_ABS_VALUE)
         field = fill_bubbles(field)
     raise MeshError(
@@ -51,16 +53,18 @@ def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Su
     """Simplify a closed surface to about `max_vertices` vertices of the same volume and topology."""
     if len(vertices) <= max_vertices:
         return vertices, faces
-    points, triangles = collapse_edges(vertices, faces, max_vertices)
-    triangles = _flip_edges(points, triangles)
-    return restore_volume(points, triangles, signed_volume(vertices, faces)), triangles
+    volume = signed_volume(vertices, faces)
+    vertices, faces = collapse_edges(vertices, faces, max_vertices)
+    faces = _flip_edges(vertices, faces)
+    return restore_volume(vertices, faces, volume), faces
 
 
 def restore_volume(vertices: Floats, faces: Integers, volume: float) -> Floats:
     """Return the vertices (V, 3) moved along their normals by one common distance, so that they enclose `volume`."""
     max_step = 0.25  # bounds the sum of all steps
     for _ in range(3):
-        step = (volume - signed_volume(vertices, faces)) / face_areas(vertices, faces).sum()
+        missing = volume - signed_volume(vertices, faces)
+        step = missing / face_areas(vertices, faces).sum()
         step = float(np.clip(step, -max_step, max_step))
         vertices = vertices + step * vertex_normals(vertices, faces)
         max_step -= abs(step)
@@ -75,9 +79,11 @@ def _non_manifold_edges(faces: Integers, n_vertices: int) -> Integers:
     are_distinct = (forward[1:] > forward[:-1]).all()
     if are_distinct and np.array_equal(forward, backward):
         return np.zeros((0, 2), dtype=np.int64)
-    forward, n_forward = np.unique(forward, return_counts=True)
-    keys = np.concatenate([forward[n_forward > 1], np.setxor1d(forward, backward)])
-    return np.stack([keys // n_vertices, keys % n_vertices], axis=1)
+    distinct, count = np.unique(forward, return_counts=True)
+    repeated = distinct[count > 1]
+    one_way = np.setxor1d(forward, backward)
+    keys = np.concatenate([repeated, one_way])
+    return np.stack(np.divmod(keys, n_vertices), axis=1)
 
 
 def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
@@ -86,67 +92,67 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
     Quadrics leave long thin triangles in flat places. There the flips lead to a Delaunay triangulation, on which the
     cotangent weights are positive. Edges at which the surface bends are kept.
     """
+    n_vertices = len(vertices)
     for _ in range(_MAX_FLIPS):
-        side, other, corners = _quadrilaterals(faces, len(vertices))
-        ends = vertices[corners]
-        a, b, c, d = ends
+        left, right, corners = _quadrilaterals(faces, n_vertices)
+        a, b, c, d = vertices[corners]
         gain = _angle(c, a, b) + _angle(d, b, a) - np.pi
         flips = np.flatnonzero(gain > _MIN_GAIN)
-        c, d = corners[2:, flips]
-        can_flip = _are_flat(*ends[:, flips]) & (c != d)
-        can_flip &= ~_are_edges(c, d, faces, len(vertices))
+        can_flip = _are_flat(*vertices[corners[:, flips]])
+        _, _, start, end = corners[:, flips]
+        can_flip &= (start != end) & ~_are_edges(start, end, faces, n_vertices)
         flips = flips[can_flip]
-        _, _, c, d = corners[:, flips]
-        new_edges = np.minimum(c, d) * len(vertices) + np.maximum(c, d)
-        left = side[flips] // 3
-        right = other[flips] // 3
-        chosen = _independent(left, right, gain[flips], new_edges)
-        if not len(chosen):
+        new_edges = edge_keys(start, end, n_vertices)[can_flip]
+        flips = flips[_independent(left[flips], right[flips], gain[flips], new_edges)]
+        if not len(flips):
             break
-        a, b, c, d = corners[:, flips[chosen]]
+        a, b, c, d = corners[:, flips]
         faces = faces.copy()
-        faces[left[chosen]] = np.stack([c, d, b], axis=1)
-        faces[right[chosen]] = np.stack([d, c, a], axis=1)
+        faces[left[flips]] = np.stack([c, d, b], axis=1)
+        faces[right[flips]] = np.stack([d, c, a], axis=1)
     return faces
 
 
 def _quadrilaterals(faces: Integers, n_vertices: int) -> tuple[Integers, Integers, Integers]:
-    """Return for each edge its side in one face, the opposite side in the face beyond, and four vertices (4, E).
+    """Return the two faces at each edge, and four vertices (4, E).
 
     These are the ends a and b of the edge, the third corner c of the one face, and the third corner d of the other.
     """
     start, end = directed_edges(faces)
     opposite = np.roll(faces, 1, axis=1).ravel()
     forward = start * n_vertices + end
+    backward = end * n_vertices + start
+    side = np.flatnonzero(start < end)
     order = np.argsort(forward)
-    side = np.nonzero(start < end)[0]
-    backward = end[side] * n_vertices + start[side]
-    other = order[np.searchsorted(forward[order], backward)]
-    return side, other, np.stack([start[side], end[side], opposite[side], opposite[other]])
+    rank = np.searchsorted(forward[order], backward[side])
+    other = order[rank]
+    corners = np.stack([start[side], end[side], opposite[side], opposite[other]])
+    return side // 3, other // 3, corners
 
 
 def _are_flat(a: Floats, b: Floats, c: Floats, d: Floats) -> Booleans:
     """Return where the triangles abc and bad, and those after a flip, have nearly the same normal."""
-    old = [np.cross(b - a, c - a), np.cross(a - b, d - b)]
-    new = [np.cross(d - c, b - c), np.cross(c - d, a - d)]
-    mean = old[0] + old[1]
-    length = np.linalg.norm(mean, axis=1, keepdims=True)
-    mean = mean / np.maximum(length, 1e-30)
+    abc = np.cross(b - a, c - a)
+    bad = np.cross(a - b, d - b)
+    cdb = np.cross(d - c, b - c)
+    dca = np.cross(c - d, a - d)
+    total = abc + bad
+    length = lengths(total)
+    mean = total / np.maximum(length, 1e-30)[:, None]
     is_flat = np.ones(len(a), dtype=bool)
-    for vectors in (*old, *new):
-        size = np.linalg.norm(vectors, axis=1)
-        is_parallel = dots(vectors, mean) > _MIN_COSINE * size
+    for normal in (abc, bad, cdb, dca):
+        size = lengths(normal)
+        is_parallel = dots(normal, mean) > _MIN_COSINE * size
         # The normal of a triangle without area does not matter.
-        has_no_area = size < 1e-3 * length[:, 0]
+        has_no_area = size < 1e-3 * length
         is_flat &= is_parallel | has_no_area
     return is_flat
 
 
 def _are_edges(a: Integers, b: Integers, faces: Integers, n_vertices: int) -> Booleans:
     """Return which pairs of vertices are edges of the surface."""
-    start, end = directed_edges(faces)
-    pairs = np.minimum(a, b) * n_vertices + np.maximum(a, b)
-    edges = np.minimum(start, end) * n_vertices + np.maximum(start, end)
+    pairs = edge_keys(a, b, n_vertices)
+    edges = edge_keys(*directed_edges(faces), n_vertices)
     return np.isin(pairs, edges)
 
 
@@ -154,21 +160,20 @@ def _independent(left: Integers, right: Integers, gain: Floats, new_edges: Integ
     """Choose flips: each face takes part only in its best one, and no two create the same edge."""
     last = max(left.max(initial=0), right.max(initial=0))
     best = np.full(last + 1, -np.inf)
-    for face in (left, right):
-        np.maximum.at(best, face, gain)
+    np.maximum.at(best, left, gain)
+    np.maximum.at(best, right, gain)
     is_best = (gain >= best[left]) & (gain >= best[right])
     chosen = np.flatnonzero(is_best)
     _, first = np.unique(new_edges[chosen], return_index=True)
     chosen = chosen[first]
-    in_flips = np.concatenate([left[chosen], right[chosen]])
-    flipped, count = np.unique(in_flips, return_counts=True)
-    repeated = flipped[count > 1]
-    is_free = ~np.isin(left[chosen], repeated) & ~np.isin(right[chosen], repeated)
-    return chosen[is_free]
+    pairs = np.stack([left[chosen], right[chosen]], axis=1)
+    n_flips = np.bincount(pairs.ravel(), minlength=last + 1)
+    is_alone = (n_flips[pairs] == 1).all(axis=1)
+    return chosen[is_alone]
 
 
 def _angle(apex: Floats, a: Floats, b: Floats) -> Floats:
     u = a - apex
     v = b - apex
-    sine = np.linalg.norm(np.cross(u, v), axis=1)
+    sine = lengths(np.cross(u, v))
     return np.arctan2(sine, dots(u, v))

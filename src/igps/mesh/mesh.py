@@ -19,6 +19,7 @@ from igps.mesh.surface import (
     diagonal,
     directed_edges,
     face_areas,
+    has_twins,
     signed_volume,
     undirected_edges,
 )
@@ -211,7 +212,7 @@ class Mesh:
         """Number of handles of all surfaces together; a MeshError for an open mesh."""
         n_vertices = len(self.vertices)
         n_faces = len(self.faces)
-        edges, _ = undirected_edges(self.faces, n_vertices)
+        edges, _ = undirected_edges(self.faces)
         if len(edges) * 2 != n_faces * 3:
             raise MeshError(
                 f"{self.name}: an open surface has no genus; a closed one was expected. Close the holes."
@@ -280,15 +281,17 @@ def check_size(vertices: Floats, name: str) -> None:
 def _check_topology(
     faces: Integers, n_vertices: int, name: str, allow_open: bool, cavities: bool
 ) -> None:
-    n_repeated = int((faces == np.roll(faces, 1, axis=1)).any(axis=1).sum())
+    n_repeated = int(has_twins(faces).sum())
     n_unused = n_vertices - len(np.unique(faces))
     start, end = directed_edges(faces)
-    edge_of = undirected_edges(faces, n_vertices)[1]
+    _, edge_of = undirected_edges(faces)
     count = np.bincount(edge_of)
     n_non_manifold = int((count > 2).sum())
     n_boundary = int((count == 1).sum())
-    balance = np.bincount(edge_of, weights=np.where(start < end, 1.0, -1.0), minlength=len(count))
-    n_inconsistent = int(((count == 2) & (balance != 0)).sum())
+    direction = np.where(start < end, 1, -1)
+    balance = np.bincount(edge_of, weights=direction)
+    is_inconsistent = (count == 2) & (balance != 0)
+    n_inconsistent = int(is_inconsistent.sum())
     n_components, _ = components(faces, n_vertices)
     read = f"Read the file with {_REPAIR}"
     for is_wrong, message in (
@@ -334,17 +337,15 @@ def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
             continue
         # Surfaces that meet in a vertex are one connected surface, but not one patch.
         _, patch = igl.bfs_orient(triangles)
-        volumes_of_patches = [
-            signed_volume(points, triangles[patch == i]) for i in range(patch.max() + 1)
-        ]
-        is_outward = max(volumes_of_patches) >= 0
+        patches = [triangles[patch == i] for i in range(patch.max() + 1)]
+        is_outward = any(signed_volume(points, faces) >= 0 for faces in patches)
         lies_inside = winding_number(*surfaces[outer], points).min() >= 0.5
-        # The cavity's own surface is left out: at its vertices, its winding number may be anything
-        # from 0 to 1.
-        others = [surface for i, surface in enumerate(surfaces) if i not in (k, outer)]
-        lies_in_another = any(
-            np.abs(winding_number(*other, points)).max() > 0.5 for other in others
-        )
+        lies_in_another = False
+        for i, other in enumerate(surfaces):
+            # The cavity's own winding number may be anything from 0 to 1 at its vertices.
+            if i not in (k, outer):
+                winding = winding_number(*other, points)
+                lies_in_another |= bool(np.abs(winding).max() > 0.5)
         if is_outward or not lies_inside or lies_in_another:
             raise MeshError(
                 f"{name}: one of {len(surfaces)} closed surfaces bounds no cavity: it is oriented "

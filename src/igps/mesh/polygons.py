@@ -12,18 +12,20 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
     Triangles come first, then the first and the second halves of quadrilaterals, then larger polygons.
     """
     starts = np.cumsum(n_corners) - n_corners
-    pieces = [corners[starts[n_corners == 3][:, None] + np.arange(3)]]
-    quads = corners[starts[n_corners == 4][:, None] + np.arange(4)]
-    pieces += [quads[:, [0, 1, 2]], quads[:, [2, 3, 0]]]
-    large = np.flatnonzero(n_corners > 4)
-    if len(large):
-        n_triangles = n_corners[large] - 2
-        n_before = np.cumsum(n_triangles) - n_triangles
-        at = np.arange(n_triangles.sum()) - np.repeat(n_before, n_triangles)
-        first = np.repeat(starts[large], n_triangles)
-        fans = [corners[first], corners[first + at + 1], corners[first + at + 2]]
-        pieces.append(np.stack(fans, axis=1))
-    return np.concatenate(pieces)
+
+    def of_size(n: int) -> Integers:
+        """Return the corners (N, n) of the polygons that have n corners."""
+        first = starts[n_corners == n]
+        return corners[first[:, None] + np.arange(n)]
+
+    quads = of_size(4)
+    is_large = n_corners > 4
+    n_triangles = n_corners[is_large] - 2
+    n_before = np.cumsum(n_triangles) - n_triangles
+    first = np.repeat(starts[is_large], n_triangles)
+    second = first + 1 + np.arange(len(first)) - np.repeat(n_before, n_triangles)
+    fans = corners[np.stack([first, second, second + 1], axis=1)]
+    return np.concatenate([of_size(3), quads[:, [0, 1, 2]], quads[:, [2, 3, 0]], fans])
 
 
 def strip_triangles(corners: Integers) -> Integers:
@@ -53,7 +55,8 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
     following = np.roll(corners, -1)
     following[starts + n_corners - 1] = corners[starts]
     # Doubled area vectors of the triangles in the fans, and of whole polygons
-    in_fan = np.cross(vertices[corners] - vertices[first], vertices[following] - vertices[first])
+    apex = vertices[first]
+    in_fan = np.cross(vertices[corners] - apex, vertices[following] - apex)
     total = sums(owner, in_fan, len(n_corners))
     with np.errstate(invalid="ignore"):  # coordinates that are not finite are refused later
         along_total = dots(in_fan, total[owner])
@@ -61,23 +64,24 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
         is_flipped = along_total < -1e-9 * squared[owner]
     is_folded = np.zeros(len(n_corners), dtype=bool)
     is_folded[owner[is_flipped]] = True
-    fans = triangles(corners[~is_folded[owner]], n_corners[~is_folded])
-    clipped = [
-        _triangulated(corners[starts[i] :][: n_corners[i]], vertices, total[i])
-        for i in np.flatnonzero(is_folded)
-    ]
-    return np.concatenate([fans, *clipped])
+    pieces = [triangles(corners[~is_folded[owner]], n_corners[~is_folded])]
+    for i in np.flatnonzero(is_folded):
+        polygon = corners[starts[i] : starts[i] + n_corners[i]]
+        pieces.append(_triangulated(polygon, vertices, total[i]))
+    return np.concatenate(pieces)
 
 
 def _triangulated(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
     """Triangulate a polygon (n,), which may be concave, into (n − 2, 3) triangles, in the plane across its normal."""
     import manifold3d
 
-    across = np.linalg.svd(normal[None])[2][1:]
+    _, _, axes = np.linalg.svd(normal[None])
+    across = axes[1:]
     if np.linalg.det([normal, *across]) < 0:
         across = across[::-1]
-    corners = (vertices[polygon] - vertices[polygon[0]]) @ across.T
-    return np.asarray(polygon[manifold3d.triangulate([corners])])
+    corners = vertices[polygon]
+    in_plane = (corners - corners[0]) @ across.T
+    return np.asarray(polygon[manifold3d.triangulate([in_plane])])
 
 
 def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:

@@ -9,7 +9,7 @@ from igps._parameters import check_at_least
 from igps.mesh._collapse_loops import collapse_edges
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import edge_lengths, longest_side, undirected_edges
+from igps.mesh.surface import edge_lengths, lengths, longest_side, undirected_edges
 
 
 def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
@@ -48,9 +48,10 @@ def _simplified_open(mesh: Mesh, surplus: int) -> Surface:
     centre = mesh.vertices.mean(axis=0)
     scale = longest_side(mesh.vertices)
     points = np.asfortranarray((mesh.vertices - centre) / scale)
+    faces = np.asfortranarray(mesh.faces)
     # A collapse removes a vertex and two faces
-    n_faces = max(len(mesh.faces) - 2 * surplus, 4)
-    points, faces, *_ = igl.qslim(points, np.asfortranarray(mesh.faces), n_faces)
+    n_faces = max(len(faces) - 2 * surplus, 4)
+    points, faces, *_ = igl.qslim(points, faces, n_faces)
     return points * scale + centre, faces
 
 
@@ -62,48 +63,44 @@ def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
     vertices = mesh.vertices
     faces = mesh.faces
     while len(vertices) < n_vertices:
-        edges, edge_of_side = undirected_edges(faces, len(vertices))
+        edges, edge_of_side = undirected_edges(faces)
         length = edge_lengths(vertices, edges)
+        n_missing = n_vertices - len(vertices)
+        longest = np.argsort(-length, kind="stable")[:n_missing]
         # A pass cuts only edges about as long as the longest, so that edges are cut in the order of their lengths.
-        longest = np.argsort(-length, kind="stable")[: n_vertices - len(vertices)]
         cut = longest[length[longest] > 0.7 * length.max()]
-        vertices, faces = _cut(vertices, faces, edges, edge_of_side, cut)
+        middle = np.full(len(edges), -1)
+        middle[cut] = len(vertices) + np.arange(len(cut))
+        vertices = np.vstack([vertices, vertices[edges[cut]].mean(axis=1)])
+        faces = _cut(vertices, faces, middle[edge_of_side].reshape(-1, 3))
     note = f"subdivided from {n_before} to {len(vertices)} vertices"
     return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))
 
 
-def _cut(
-    vertices: Floats, faces: Integers, edges: Integers, edge_of_side: Integers, cut: Integers
-) -> Surface:
-    """Add the midpoints of the edges `cut` as vertices, and divide the faces at these edges."""
-    middle = np.full(len(edges), -1)
-    middle[cut] = len(vertices) + np.arange(len(cut))
-    vertices = np.vstack([vertices, vertices[edges[cut]].mean(axis=1)])
-    middle_of_side = middle[edge_of_side].reshape(-1, 3)
-    n_cut = (middle_of_side >= 0).sum(axis=1)
+def _cut(vertices: Floats, faces: Integers, middle: Integers) -> Integers:
+    """Divide faces at the vertices in the middle of their sides (F, 3), each from a corner to the next; -1 for none."""
+    n_cut = (middle >= 0).sum(axis=1)
     pieces = [faces[n_cut == 0]]
     for n in (1, 2, 3):
-        f = faces[n_cut == n]
-        k = middle_of_side[n_cut == n]
+        chosen = n_cut == n
+        middles = middle[chosen]
         # The corners are rotated so that the cut sides come first.
-        turn = np.zeros(len(f), dtype=np.int64)
-        if n == 1:
-            turn = np.argmax(k >= 0, axis=1)
-        elif n == 2:
-            turn = np.argmin(k >= 0, axis=1) + 1
+        turn = np.argmax(middles >= 0, axis=1)
+        if n == 2:
+            turn = np.argmin(middles >= 0, axis=1) + 1
         order = (np.arange(3) + turn[:, None]) % 3
-        a, b, c = np.take_along_axis(f, order, axis=1).T
-        p, q, r = np.take_along_axis(k, order, axis=1).T
+        a, b, c = np.take_along_axis(faces[chosen], order, axis=1).T
+        p, q, r = np.take_along_axis(middles, order, axis=1).T
         if n == 1:
             corners = [(a, p, c), (p, b, c)]
         elif n == 2:
             # The quadrilateral a p q c is divided along its shorter diagonal.
-            from_a = np.linalg.norm(vertices[a] - vertices[q], axis=1)
-            from_p = np.linalg.norm(vertices[p] - vertices[c], axis=1)
+            from_a = lengths(vertices[a] - vertices[q])
+            from_p = lengths(vertices[p] - vertices[c])
             by_a = from_a < from_p
             third = (np.where(by_a, a, p), np.where(by_a, p, q), np.where(by_a, q, c))
             corners = [(p, b, q), (a, np.where(by_a, q, p), c), third]
         else:
             corners = [(a, p, r), (p, b, q), (r, q, c), (p, q, r)]
         pieces.extend(np.stack(corner, axis=1) for corner in corners)
-    return vertices, np.vstack(pieces)
+    return np.vstack(pieces)

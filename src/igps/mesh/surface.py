@@ -9,7 +9,8 @@ from scipy.sparse.csgraph import connected_components
 
 from igps._arrays import Booleans, Floats, Integers, Surface
 
-_FLAT = 2.0**-26  # triangles of at most this height over length count as flat
+TINY = float(np.finfo(float).tiny)  # the smallest divisor that is as precise as others
+_FLAT = 2.0**-26  # triangles of at most this height over length are flat up to rounding errors
 
 
 def area_vectors(vertices: Floats, faces: Integers) -> Floats:
@@ -22,26 +23,33 @@ def area_vectors(vertices: Floats, faces: Integers) -> Floats:
 
 def face_areas(vertices: Floats, faces: Integers) -> Floats:
     """Return the areas (F,), length²."""
-    return np.linalg.norm(area_vectors(vertices, faces), axis=1)
+    return lengths(area_vectors(vertices, faces))
 
 
 def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
     """Return a third of the area of the faces around each vertex: (V,), length²."""
-    third = np.repeat(face_areas(vertices, faces) / 3, 3)
-    areas = np.bincount(faces.ravel(), third, len(vertices))
+    thirds = face_areas(vertices, faces) / 3
+    at_corners = np.repeat(thirds, 3)
+    areas = np.bincount(faces.ravel(), at_corners, len(vertices))
     return np.asarray(areas, dtype=np.float64)
 
 
 def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
     """Return the outward unit normals (V, 3) of the vertices: means of the face normals, weighted by area."""
     at_corners = np.repeat(area_vectors(vertices, faces), 3, axis=0)
-    return unit(sums(faces.ravel(), at_corners, len(vertices)))
+    around = sums(faces.ravel(), at_corners, len(vertices))
+    return unit(around)
 
 
 def sums(index: Integers, rows: Floats, n: int) -> Floats:
     """Return the sums (n, D) of the rows (R, D) with each index (R,)."""
     columns = [np.bincount(index, column, n) for column in rows.T]
     return np.stack(columns, axis=1)
+
+
+def lengths(vectors: Floats) -> Floats:
+    """Return the lengths (N,) of vectors (N, D)."""
+    return np.linalg.norm(vectors, axis=1)
 
 
 def dots(first: Floats, second: Floats) -> Floats:
@@ -51,35 +59,38 @@ def dots(first: Floats, second: Floats) -> Floats:
 
 def edge_lengths(vertices: Floats, edges: Integers) -> Floats:
     """Return the lengths (E,) of edges (E, 2)."""
-    start = vertices[edges[:, 0]]
-    end = vertices[edges[:, 1]]
-    return np.linalg.norm(end - start, axis=1)
+    start, end = edges.T
+    return lengths(vertices[end] - vertices[start])
 
 
 def mean_of_neighbours(vertices: Floats, faces: Integers) -> Floats:
     """Return the mean (V, 3) of each vertex's neighbours, weighted by inverse squared distance, length."""
-    ends = undirected_edges(faces, len(vertices))[0]
-    squares = np.square(edge_lengths(vertices, ends))
+    n = len(vertices)
+    edges, _ = undirected_edges(faces)
+    squares = np.square(edge_lengths(vertices, edges))
     # Coincident vertices get a large weight, without a division by zero.
     weights = 1 / np.maximum(squares, 1e-12 * squares.mean())
-    total = np.zeros(len(vertices))
+    total = np.zeros(n)
     mean = np.zeros_like(vertices)
-    for here, there in (ends.T, ends.T[::-1]):
-        total += np.bincount(here, weights, len(vertices))
-        mean += sums(here, weights[:, None] * vertices[there], len(vertices))
+    start, end = edges.T
+    for here, there in ((start, end), (end, start)):
+        weighted = weights[:, None] * vertices[there]
+        total += np.bincount(here, weights, n)
+        mean += sums(here, weighted, n)
     return mean / total[:, None]
 
 
 def unit(vectors: Floats) -> Floats:
     """Return the vectors (N, 3) scaled to length 1; zero vectors stay zero."""
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.maximum(lengths, np.finfo(float).tiny)
+    divisors = np.maximum(lengths(vectors), TINY)
+    return vectors / divisors[:, None]
 
 
 def box_sides(points: Floats) -> Floats:
     """Return the sides (3,) of the bounding box of points (N, 3), length."""
-    # With contiguous columns NumPy takes a thirtieth of the time.
-    return np.asarray(np.ptp(np.ascontiguousarray(points.T), axis=1))
+    # NumPy takes a thirtieth of the time for contiguous coordinates.
+    coordinates = np.ascontiguousarray(points.T)
+    return np.asarray(np.ptp(coordinates, axis=1))
 
 
 def longest_side(points: Floats) -> float:
@@ -94,25 +105,50 @@ def diagonal(vertices: Floats) -> float:
 
 def directed_edges(faces: Integers) -> tuple[Integers, Integers]:
     """Return the first and the second vertex of every side of every face: (3F,) each, face by face."""
-    return faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    following = np.roll(faces, -1, axis=1)
+    return faces.ravel(), following.ravel()
 
 
-def undirected_edges(faces: Integers, n_vertices: int) -> tuple[Integers, Integers]:
+def undirected_edges(faces: Integers) -> tuple[Integers, Integers]:
     """Return the edges (E, 2) in ascending order, the smaller vertex first, and the edge (3F,) of every side."""
+    n_vertices = int(faces.max(initial=-1)) + 1
     start, end = directed_edges(faces)
-    key_of_side = np.minimum(start, end) * n_vertices + np.maximum(start, end)
-    keys, edge_of = np.unique(key_of_side, return_inverse=True)
-    edges = np.stack([keys // n_vertices, keys % n_vertices], axis=1)
+    keys = edge_keys(start, end, n_vertices)
+    distinct, edge_of = np.unique(keys, return_inverse=True)
+    edges = np.stack(np.divmod(distinct, n_vertices), axis=1)
     return edges, edge_of
+
+
+def has_twins(faces: Integers) -> Booleans:
+    """Return which faces (F,) have the same vertex twice."""
+    is_twin = faces == np.roll(faces, 1, axis=1)
+    return np.asarray(is_twin.any(axis=1))
+
+
+def edge_keys(start: Integers, end: Integers, n_vertices: int) -> Integers:
+    """Return a number (E,) for each edge, the same in both directions, by which edges sort by their vertices."""
+    return np.minimum(start, end) * n_vertices + np.maximum(start, end)
+
+
+def faces_at_sides(faces: Integers) -> Integers:
+    """Return the number (F, 3) of faces that share the side from each corner to the next."""
+    _, edge_of = undirected_edges(faces)
+    n_faces = np.bincount(edge_of)
+    return np.asarray(n_faces[edge_of].reshape(-1, 3))
 
 
 def components(faces: Integers, n_vertices: int) -> tuple[int, NDArray[np.int32]]:
     """Return the number of connected components, and the component (V,) of each vertex, from 0."""
     start, end = directed_edges(faces)
+    return linked(start, end, n_vertices)
+
+
+def linked(start: Integers, end: Integers, n: int) -> tuple[int, NDArray[np.int32]]:
+    """Return the number of groups that links from start to end make of n items, and the group (n,) of each, from 0."""
     ones = np.ones(len(start), dtype=np.int8)
-    graph = sparse.coo_array((ones, (start, end)), shape=(n_vertices, n_vertices))
-    count, label = connected_components(graph, directed=False)
-    return int(count), label
+    graph = sparse.coo_array((ones, (start, end)), shape=(n, n))
+    count, group = connected_components(graph, directed=False)
+    return int(count), group
 
 
 def face_parts(vertices: Floats, faces: Integers) -> tuple[Integers, Floats]:
@@ -127,7 +163,8 @@ def signed_volume(vertices: Floats, faces: Integers) -> float:
     """Return the enclosed volume, length³, negative if inside out; for an open surface, of its cone over the centre."""
     centred = vertices - vertices.mean(axis=0)
     bases = area_vectors(centred, faces)
-    return float(np.einsum("ij,ij->", centred[faces[:, 0]], bases) / 3)
+    corners = centred[faces[:, 0]]
+    return float(np.einsum("ij,ij->", corners, bases) / 3)
 
 
 def compact(vertices: Floats, faces: Integers) -> Surface:
@@ -139,8 +176,8 @@ def compact(vertices: Floats, faces: Integers) -> Surface:
 def connected(vertices: Floats, faces: Integers) -> list[Surface]:
     """Return the connected components as surfaces, in the order of their first vertices."""
     count, component = components(faces, len(vertices))
-    of_face = component[faces[:, 0]]
-    return [compact(vertices, faces[of_face == k]) for k in range(count)]
+    part = component[faces[:, 0]]
+    return [compact(vertices, faces[part == k]) for k in range(count)]
 
 
 def largest(vertices: Floats, faces: Integers) -> Surface:
@@ -161,10 +198,9 @@ def stacked(surfaces: Sequence[Surface]) -> Surface:
     return np.concatenate(all_vertices), np.concatenate(all_faces)
 
 
-def has_area(corners: Floats) -> Booleans:
-    """Return whether triangles with corners (F, 3, 3) have an area, beyond rounding errors: (F,)."""
+def has_area(corners: Floats, flat: float = _FLAT) -> Booleans:
+    """Return whether triangles with corners (F, 3, 3) have more than a height of `flat` over their longest side."""
     sides = corners - np.roll(corners, 1, axis=1)
-    longest = (sides**2).sum(axis=2).max(axis=1)
+    squares = np.square(sides).sum(axis=2)
     normals = np.cross(sides[:, 0], sides[:, 1])
-    double_areas = np.linalg.norm(normals, axis=1)
-    return np.asarray(double_areas > _FLAT * longest)
+    return np.asarray(lengths(normals) > flat * squares.max(axis=1))

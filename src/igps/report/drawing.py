@@ -81,7 +81,7 @@ def paint(
 
 def faired(vertices: Floats, faces: Integers) -> Floats:
     """Return vertices (V, 3) without the terraces of voxels, for drawing only (Taubin 1995)."""
-    edges, _ = undirected_edges(faces, len(vertices))
+    edges, _ = undirected_edges(faces)
     here = edges.ravel()
     there = edges[:, ::-1].ravel()
     counts = np.bincount(here, minlength=len(vertices))

@@ -28,8 +28,8 @@ def mesh(body: Sequence[Placed], target: int) -> tuple[Floats, Integers, float]:
         low, grid = _sample(body, spacing)
         # Keep vertices away from grid points: otherwise they may coincide, and faces degenerate.
         least = _SNAP * spacing
-        near = np.abs(grid) < least
-        grid[near] = np.where(grid[near] < 0.0, -least, least)
+        snapped = np.where(grid < 0.0, -least, least)
+        grid = np.where(np.abs(grid) < least, snapped, grid)
         points, faces, _, _ = marching_cubes(grid, 0.0, gradient_direction="descent")
         ratio = len(points) / target
         if abs(ratio - 1.0) < 0.1:
@@ -44,7 +44,8 @@ def roughen(
     vertices: Floats, faces: Integers, amplitude: float, wavelength: float, rng: np.random.Generator
 ) -> Floats:
     """Move vertices (V,3) along their normals by random waves; ``amplitude`` is the standard deviation."""
-    waves = rng.normal(size=(12, 3)) * (2.0 * np.pi / wavelength / np.sqrt(3.0))
+    frequency = 2.0 * np.pi / wavelength
+    waves = rng.normal(size=(12, 3)) * (frequency / np.sqrt(3.0))
     phases = rng.uniform(0.0, 2.0 * np.pi, 12)
     noise = np.zeros(len(vertices))
     x, y, z = vertices.T
@@ -62,7 +63,8 @@ def defect(
     """Return what makes a mesh unfit for the benchmark, in words, or None; ``min_angle`` in degrees."""
     import igl
 
-    if abs(len(vertices) / n_vertices - 1.0) > _VERTEX_TOLERANCE:
+    ratio = len(vertices) / n_vertices
+    if abs(ratio - 1.0) > _VERTEX_TOLERANCE:
         return f"{len(vertices)} vertices"
     try:
         body = Mesh(vertices, faces)
@@ -72,7 +74,8 @@ def defect(
         return f"genus {body.genus}, expected {genus}"
     if body.notes:
         return "inside out"
-    angle = float(np.degrees(igl.internal_angles(vertices, faces).min()))
+    angles = igl.internal_angles(vertices, faces)
+    angle = float(np.degrees(angles.min()))
     if not angle >= min_angle:  # NaN if corners coincide or are collinear
         return f"a triangle with an angle of {angle:.2g} degrees"
     return None
@@ -94,10 +97,8 @@ def _smooth_minimum(a: Floats, b: Floats, blend: float) -> Floats:
 
 
 def _bounds(body: Sequence[Placed]) -> tuple[Floats, Floats]:
-    corners = np.array([part.bounds() for part in body])
-    low = corners[:, 0].min(axis=0)
-    high = corners[:, 1].max(axis=0)
-    return low, high
+    lows, highs = zip(*(part.bounds() for part in body), strict=True)
+    return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
 def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
@@ -107,7 +108,7 @@ def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
     low = low - margin
     n_steps = np.ceil((high + margin - low) / spacing)
     shape = n_steps.astype(int) + 1
-    axes = [low[i] + spacing * np.arange(shape[i]) for i in range(3)]
+    x, y, z = (start + spacing * np.arange(n) for start, n in zip(low, shape, strict=True))
     grid = np.full(shape, 1e3)  # far outside
     for part in body:
         first, last = part.bounds()
@@ -115,18 +116,17 @@ def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
         last_step = np.ceil((last + margin - low) / spacing)
         start = np.maximum(first_step.astype(int), 0)
         stop = np.minimum(last_step.astype(int) + 1, shape)
-        window = tuple(slice(start[i], stop[i]) for i in range(3))
-        x, y, z = (axes[i][window[i]] for i in range(3))
-        distance = part.distance(*np.ix_(x, y, z))
-        grid[window] = _smooth_minimum(grid[window], distance, part.blend)
+        i, j, k = map(slice, start, stop)
+        distance = part.distance(*np.ix_(x[i], y[j], z[k]))
+        grid[i, j, k] = _smooth_minimum(grid[i, j, k], distance, part.blend)
     return low, grid
 
 
 def _rough_area(body: Sequence[Placed]) -> float:
     """Estimate the surface area from the volume of a band that reaches one coarse cell to both sides of the surface."""
     low, high = _bounds(body)
-    volume = np.prod(high - low)
-    spacing = float((volume / _COARSE_CELLS) ** (1.0 / 3.0))
+    volume = float(np.prod(high - low))
+    spacing = (volume / _COARSE_CELLS) ** (1.0 / 3.0)
     _, grid = _sample(body, spacing)
     n_near = float(np.count_nonzero(np.abs(grid) < spacing))
     return n_near * spacing**2 / 2.0
@@ -137,11 +137,13 @@ def _relax(body: Sequence[Placed], vertices: Floats, faces: Integers, spacing: f
     start, end = surface.directed_edges(faces)
     n = len(vertices)
     adjacency = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(n, n))
-    degree = np.bincount(start, minlength=len(vertices))[:, None]
+    degree = np.bincount(start, minlength=n)[:, None]
     for _ in range(_RELAXATION_STEPS):
         normals = surface.vertex_normals(vertices, faces)
-        step = (adjacency @ vertices) / degree - vertices
-        step -= normals * (step * normals).sum(axis=1, keepdims=True)
+        mean = (adjacency @ vertices) / degree
+        step = mean - vertices
+        along_normal = (step * normals).sum(axis=1, keepdims=True)
+        step -= normals * along_normal
         vertices = vertices + 0.7 * step
         heights = np.clip(_distance(body, vertices), -0.5 * spacing, 0.5 * spacing)
         vertices -= normals * heights[:, None]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -62,11 +63,7 @@ class Cone(Solid):
         return lower, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
-        return Cone(
-            length=self.length * length,
-            start=self.start * thick,
-            end=self.end * thick,
-        )
+        return Cone(self.length * length, self.start * thick, self.end * thick)
 
 
 @dataclass(frozen=True)
@@ -84,8 +81,7 @@ class Arc(Solid):
         turned = np.arctan2(z, self.bend - y) - half
         turned = np.mod(turned + np.pi, 2.0 * np.pi) - np.pi
         turned = np.clip(turned, -half, half) + half
-        centre_y = self.bend * (1.0 - np.cos(turned))
-        centre_z = self.bend * np.sin(turned)
+        centre_y, centre_z = self._centre_line(turned)
         growth = (self.end - self.start) / self.angle
         tube = self.start + growth * turned
         squared = x * x + (y - centre_y) ** 2 + (z - centre_z) ** 2
@@ -93,30 +89,26 @@ class Arc(Solid):
 
     def box(self) -> tuple[Floats, Floats]:
         wide = max(self.start, self.end)
-        turned = np.linspace(0.0, self.angle, 33)
-        y = self.bend * (1.0 - np.cos(turned))
-        z = self.bend * np.sin(turned)
+        y, z = self._centre_line(np.linspace(0.0, self.angle, 33))
         slack = wide + 0.01 * self.bend  # as the points may miss the ends of the arc's extent
         lower = np.array([-wide, y.min() - slack, z.min() - slack])
         upper = np.array([wide, y.max() + slack, z.max() + slack])
         return lower, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
-        return Arc(
-            bend=self.bend * length,
-            angle=self.angle,
-            start=self.start * thick,
-            end=self.end * thick,
-        )
+        return Arc(self.bend * length, self.angle, self.start * thick, self.end * thick)
 
     def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)
 
     def tip(self) -> Vector:
         """Return the far end of the centre line."""
-        y = self.bend * (1.0 - np.cos(self.angle))
-        z = self.bend * np.sin(self.angle)
+        y, z = self._centre_line(self.angle)
         return (0.0, y, z)
+
+    def _centre_line(self, turned: Any) -> tuple[Any, Any]:
+        """Return y and z of the centre line, after it has turned by these angles."""
+        return self.bend * (1.0 - np.cos(turned)), self.bend * np.sin(turned)
 
 
 @dataclass(frozen=True)
@@ -151,13 +143,15 @@ class Box(Solid):
     rounding: float
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        beyond = []  # each side of the box without its rounding
+        # Distances from the sides of the box without its rounding, positive beyond them
+        squared = np.zeros(())
+        nearest = np.full((), -np.inf)
         for coordinate, size in zip((x, y, z), self.size, strict=True):
-            beyond.append(np.abs(coordinate) - (0.5 * size - self.rounding))
-        a, b, c = beyond
-        squared = np.maximum(a, 0.0) ** 2 + np.maximum(b, 0.0) ** 2 + np.maximum(c, 0.0) ** 2
+            beyond = np.abs(coordinate) - (0.5 * size - self.rounding)
+            squared = squared + np.maximum(beyond, 0.0) ** 2
+            nearest = np.maximum(nearest, beyond)
         outside = np.sqrt(squared)
-        inside = np.minimum(np.maximum(np.maximum(a, b), c), 0.0)
+        inside = np.minimum(nearest, 0.0)
         return outside + inside - self.rounding
 
     def box(self) -> tuple[Floats, Floats]:
@@ -189,18 +183,21 @@ class Shell(Solid):
         for (r0, z0), (r1, z1) in itertools.pairwise(self.profile):
             dr = r1 - r0
             dz = z1 - z0
-            projected = (radial - r0) * dr + (z - z0) * dz
-            along = np.clip(projected / (dr * dr + dz * dz), 0.0, 1.0)
-            to_segment = (radial - r0 - along * dr) ** 2 + (z - z0 - along * dz) ** 2
+            across = radial - r0
+            up = z - z0
+            along = (across * dr + up * dz) / (dr * dr + dz * dz)
+            along = np.clip(along, 0.0, 1.0)
+            to_segment = (across - along * dr) ** 2 + (up - along * dz) ** 2
             squared = np.minimum(squared, to_segment)
         return np.sqrt(squared) - 0.5 * self.wall
 
     def box(self) -> tuple[Floats, Floats]:
         radii, heights = np.array(self.profile).T
-        wide = radii.max() + 0.5 * self.wall
-        low = heights.min() - 0.5 * self.wall
-        high = heights.max() + 0.5 * self.wall
-        return np.array([-wide, -wide, low]), np.array([wide, wide, high])
+        half = 0.5 * self.wall
+        wide = radii.max() + half
+        lower = np.array([-wide, -wide, heights.min() - half])
+        upper = np.array([wide, wide, heights.max() + half])
+        return lower, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
         profile = tuple((r * thick, z * length) for r, z in self.profile)

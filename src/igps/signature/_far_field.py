@@ -16,7 +16,7 @@ point y, and h the distance from x to the tangent plane at y. Far away the kerne
 """
 
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, product
 from typing import Self
 
 import numpy as np
@@ -25,7 +25,7 @@ from scipy import sparse
 
 from igps._arrays import Floats, Integers
 from igps._threads import SERIAL, Team
-from igps.mesh.surface import has_area
+from igps.mesh.surface import has_area, lengths
 from igps.signature._weight_loops import (
     Touched,
     add_near_faces,
@@ -38,22 +38,27 @@ from igps.signature.ordering import principal_axes, spatial_order
 _LEAF_SIZE = 32  # hats in the smallest clusters; a cluster costs as much as 19 hats
 _N_TERMS = 19
 _HALF_DIAGONAL = 1 - np.eye(3) / 2  # halves the diagonal of a matrix plus its transpose
-# The products of coordinates in quadratic and cubic forms
-_PAIRS = list(combinations_with_replacement(range(3), 2))
-_TRIPLES = list(combinations_with_replacement(range(3), 3))
-_SQUARES = np.array([float(i == j) for i, j in _PAIRS])  # coefficients of |e|²
+# The products of two coordinates, xx, xy, xz, yy, yz, zz, by the coordinates of each
+_ROWS, _COLUMNS = np.triu_indices(3)
+_SQUARES = np.where(_ROWS == _COLUMNS, 1.0, 0.0)  # coefficients of |e|²
 # (6, 3, 3) matrix of each product of two coordinates
-_MATRICES = np.array(
-    [(np.outer(a, b) + np.outer(b, a)) / 2 for a, b in np.eye(3)[np.array(_PAIRS)]]
-)
-# (18, 10) to which product of three coordinates each product of one and two belongs
-_CUBES = np.array(
-    [
-        [float(sorted((i, *pair)) == list(triple)) for triple in _TRIPLES]
-        for i in range(3)
-        for pair in _PAIRS
-    ]
-)
+_MATRICES = np.zeros((6, 3, 3))
+_MATRICES[range(6), _ROWS, _COLUMNS] += 0.5
+_MATRICES[range(6), _COLUMNS, _ROWS] += 0.5
+
+
+def _cubes() -> Floats:
+    """Return (18, 10) to which product of three coordinates each product of one and two belongs."""
+    cubes: list[tuple[int, ...]] = list(combinations_with_replacement(range(3), 3))
+    pairs = combinations_with_replacement(range(3), 2)
+    table = np.zeros((18, 10))
+    for row, (one, two) in enumerate(product(range(3), pairs)):
+        factors = sorted((one, *two))
+        table[row, cubes.index(tuple(factors))] = 1
+    return table
+
+
+_CUBES = _cubes()
 
 
 class HatSurface:
@@ -80,32 +85,20 @@ class HatSurface:
             raise ValueError(
                 "faces: expected at least one face with an area, got flat ones only; check the mesh"
             )
-        used = np.flatnonzero(np.bincount(faces.ravel(), minlength=len(vertices)))
+        used = np.flatnonzero(np.bincount(faces.ravel()))
         self.axes = principal_axes(vertices[used])
         vertices = vertices @ self.axes
         self.order = used[spatial_order(vertices[used], _LEAF_SIZE)]
         rank = np.empty(len(vertices), np.int64)
         rank[self.order] = np.arange(len(self.order))
-        vertices = vertices[self.order]
         self.faces = rank[faces]
-
+        vertices = vertices[self.order]
         corners = vertices[self.faces]
-        sides = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
-        normals = np.cross(sides[:, 0], sides[:, 1])
-        double_areas = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals /= double_areas
-        inward = np.cross(normals[:, None], sides[:, :2])
-        squared_sides = np.square(sides).sum(axis=2)
-        triangles = corners.reshape(-1, 9)
-        columns = (triangles, normals, inward.reshape(-1, 6), squared_sides, double_areas)
-        self.table = np.concatenate(columns, axis=1)
-        n_corners = 3 * len(faces)
-        ones = np.ones(n_corners)
-        starts = np.arange(n_corners + 1)
-        shape = (len(vertices), n_corners)
-        incidence = sparse.csc_matrix((ones, self.faces.ravel(), starts), shape=shape)
-        incidence = incidence.tocsr()
-        self.hats = _hats(vertices, incidence, corners, normals, double_areas / 6, squared_sides)
+        self.table = _face_table(corners)
+        n_corners = self.faces.size
+        columns = (np.ones(n_corners), self.faces.ravel(), np.arange(n_corners + 1))
+        incidence = sparse.csc_matrix(columns, shape=(len(vertices), n_corners)).tocsr()
+        self.hats = _hats(vertices, incidence, corners, self.table)
         self.face_starts = incidence.indptr.astype(np.int64)
         self.incident_faces = incidence.indices.astype(np.int64) // 3
 
@@ -131,33 +124,47 @@ class HatSurface:
         last_rows[row_of[corners], on_surface[:, None]] = touched.barycentric[on_surface]
 
 
-def _hats(
-    vertices: Floats,
-    incidence: sparse.csr_matrix,
-    corners: Floats,
-    normals: Floats,
-    third_areas: Floats,
-    squared_sides: Floats,
-) -> Floats:
-    """Return `HatSurface.hats`, from third_areas (F, 1) and `incidence` (V, 3 F), which sums over the corners.
+def _face_table(corners: Floats) -> Floats:
+    """Return `HatSurface.table`, from the corners (F, 3, 3)."""
+    sides = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
+    normals = np.cross(sides[:, 0], sides[:, 1])
+    double_areas = lengths(normals)[:, None]
+    normals /= double_areas
+    inward = np.cross(normals[:, None], sides[:, :2])
+    squared_sides = np.square(sides).sum(axis=2)
+    columns = [
+        corners.reshape(-1, 9),
+        normals,
+        inward.reshape(-1, 6),
+        squared_sides,
+        double_areas,
+    ]
+    return np.concatenate(columns, axis=1)
+
+
+def _hats(vertices: Floats, incidence: sparse.csr_matrix, corners: Floats, table: Floats) -> Floats:
+    """Return `HatSurface.hats`, from corners (F, 3, 3), and `incidence` (V, 3 F), which sums over the corners.
 
     Over a face with corners v, a, b and t = v + a + b the hat of v has the mean (v + t)/4 and the second moment
     (2vvᵀ + vtᵀ + tvᵀ + ttᵀ + aaᵀ + bbᵀ + vvᵀ)/20.
     """
+    normals = table[:, 9:12]
+    squared_sides = table[:, 18:21]
+    third_areas = table[:, 21:] / 6
+
+    def integral(values: Floats) -> Floats:
+        """Return the integrals (V, …) over all hats of values (F, …) on the faces."""
+        by_face = third_areas * values.reshape(len(values), -1)
+        by_hat = incidence @ np.repeat(by_face, 3, axis=0)
+        return np.asarray(by_hat).reshape(-1, *values.shape[1:])
+
     total = corners.sum(axis=1)
-    moments = _outer(total, total) + corners.transpose(0, 2, 1) @ corners
-    columns = [
-        np.ones_like(third_areas),
-        total,
-        normals,
-        moments.reshape(-1, 9),
-        _outer(normals, total).reshape(-1, 9),
-    ]
-    by_face = third_areas * np.concatenate(columns, axis=1)
-    sums = incidence @ np.repeat(by_face, 3, axis=0)
-    mass, total, flux, moments, normal_moments = np.split(sums, (1, 4, 7, 16), axis=1)
-    total = total / mass
-    moments = moments.reshape(-1, 3, 3) / mass[..., None]
+    mass = integral(np.ones_like(third_areas))
+    flux = integral(normals)
+    normal_moments = integral(_outer(normals, total)) / 4
+    moments = integral(_outer(total, total) + corners.transpose(0, 2, 1) @ corners)
+    moments = moments / mass[..., None]
+    total = integral(total) / mass
     centres = (vertices + total) / 4
     to_vertex = vertices - centres
     mixed = _outer(vertices, total)
@@ -165,7 +172,6 @@ def _hats(
     hat_moments = (own + mixed + mixed.transpose(0, 2, 1) + moments) / 20
     covariance = hat_moments - _outer(centres, centres)
     shifts = vertices / 4 - centres
-    normal_moments = normal_moments.reshape(-1, 3, 3) / 4
     normal_moments = normal_moments + _outer(flux, shifts)
     trace = np.trace(covariance, axis1=1, axis2=2)[:, None]
     # At each corner, the longer of its two sides
@@ -173,13 +179,13 @@ def _hats(
     other_side = np.roll(squared_sides, -2, axis=1)
     longest = np.sqrt(np.maximum(one_side, other_side)).ravel()
     extents = np.maximum.reduceat(longest[incidence.indices], incidence.indptr[:-1])
-    radii = extents[:, None] + np.linalg.norm(to_vertex, axis=1, keepdims=True)
+    radii = extents + lengths(to_vertex)
     constant = (flux * to_vertex).sum(axis=1, keepdims=True)
     tilted = np.einsum("vij,vi->vj", normal_moments, to_vertex)
     linear = -4 * tilted - 2 * trace * flux
     parts = [
         centres,
-        radii,
+        radii[:, None],
         constant,
         flux,
         -2 * trace * constant,
@@ -197,7 +203,7 @@ def _outer(left: Floats, right: Floats) -> Floats:
 def _entries(forms: Floats) -> Floats:
     """Return the coefficients (n, 6) of xx, xy, xz, yy, yz, zz of quadratic forms (n, 3, 3)."""
     coefficients = (forms + forms.transpose(0, 2, 1)) * _HALF_DIAGONAL
-    return coefficients[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
+    return coefficients[:, _ROWS, _COLUMNS]
 
 
 @dataclass(frozen=True)
@@ -224,14 +230,15 @@ class HatClusters:
         radii = []
         for size in sizes:
             starts = np.arange(0, n_hats, size)
-            counts = np.diff(np.append(starts, n_hats))
+            counts = np.diff(starts, append=n_hats)
             centre = np.add.reduceat(hat_centres, starts) / counts[:, None]
             arms = hat_centres - np.repeat(centre, counts, axis=0)
-            extents = np.linalg.norm(arms, axis=1) + hat_radii
+            extents = lengths(arms) + hat_radii
             centres.append(centre)
             radii.append(np.maximum.reduceat(extents, starts))
         level_starts = np.cumsum([0, *map(len, radii)])
-        sums = np.empty((level_starts[-1], _N_TERMS, functions.shape[1]), functions.dtype)
+        shape = (level_starts[-1], _N_TERMS, functions.shape[1])
+        sums = np.empty(shape, functions.dtype)
 
         def fill(level: int) -> None:
             size = sizes[level]
@@ -266,11 +273,13 @@ def _cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats) -> F
     """
     cluster = np.arange(len(hats)) // size
     scale = 1 / radii[cluster, None]
-    s = scale * (hats[:, :3] - centres[cluster])
+    to_hats = hats[:, :3] - centres[cluster]
+    s = scale * to_hats
     flux = scale**3 * hats[:, 5:8]
     # The coefficients of forms; S is −4 dᵀTd, and B is 12 dᵀCd
     tilt = -(scale**4) / 4 * hats[:, 12:18]
-    spread = scale**2 / 12 * hats[:, 18:24] + _entries(_outer(s, s))
+    spread = scale**2 / 12 * hats[:, 18:24]
+    spread += _entries(_outer(s, s))
     first = tilt + _entries(_outer(flux, s))
     second = _trace(first) * _SQUARES - 4 * first
     g = 2 * _trace(tilt) * s + _trace(spread) * flux

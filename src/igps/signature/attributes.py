@@ -6,7 +6,7 @@ import numpy as np
 
 from igps._arrays import Floats, Integers, Singles
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import area_vectors, unit
+from igps.mesh.surface import area_vectors, lengths, unit
 from igps.signature.config import AttributeName
 from igps.signature.surface_potential import surface_potential
 
@@ -15,11 +15,12 @@ def interior_attributes(
     mesh: Mesh, points: Floats, names: Sequence[AttributeName]
 ) -> Mapping[str, Singles]:
     """Return the named attributes (P,), or (P, 3) for a direction, of interior points (P, 3); none depends on scale."""
-    functions = {
-        function.__name__: function
-        for function in (depth, electrostatic_potential, surface_direction)
-    }
-    return {name: functions[name](mesh, points).astype(np.float32) for name in names}
+    attributes = {}
+    for function in (depth, electrostatic_potential, surface_direction):
+        if function.__name__ in names:
+            values = function(mesh, points)
+            attributes[function.__name__] = values.astype(np.float32)
+    return attributes
 
 
 def surface_attributes(
@@ -34,7 +35,8 @@ def surface_attributes(
 
 def depth(mesh: Mesh, points: Floats) -> Floats:
     """Return the distances (P,) of points (P, 3) from the surface over √area: at most 0.28, in the centre of a ball."""
-    return np.linalg.norm(_vectors_to_surface(mesh, points), axis=1) / np.sqrt(mesh.area)
+    distances = lengths(_vectors_to_surface(mesh, points))
+    return distances / np.sqrt(mesh.area)
 
 
 def surface_direction(mesh: Mesh, points: Floats) -> Floats:
@@ -49,11 +51,8 @@ def surface_direction(mesh: Mesh, points: Floats) -> Floats:
 def _vectors_to_surface(mesh: Mesh, points: Floats) -> Floats:
     import igl
 
-    *_, nearest = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(points),
-        np.ascontiguousarray(mesh.vertices),
-        np.ascontiguousarray(mesh.faces),
-    )
+    arrays = map(np.ascontiguousarray, (points, mesh.vertices, mesh.faces))
+    _, _, nearest = igl.point_mesh_squared_distance(*arrays)
     return np.asarray(nearest) - points
 
 
@@ -65,4 +64,5 @@ def electrostatic_potential(mesh: Mesh, points: Floats) -> Floats:
     section 4, names electrostatic potentials as a further dimension; if a body has charges of its own (a protein), pass
     their potential as an attribute instead. See `surface_potential` for the method and its error.
     """
-    return surface_potential(mesh.vertices, mesh.faces, points) / np.sqrt(mesh.area)
+    potentials = surface_potential(mesh.vertices, mesh.faces, points)
+    return potentials / np.sqrt(mesh.area)

@@ -5,10 +5,10 @@ from typing import get_args
 import numpy as np
 from scipy import sparse
 
-from igps._arrays import Floats, Integers
+from igps._arrays import Floats
 from igps._parameters import check_one_of
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import longest_side
+from igps.mesh.surface import lengths, longest_side
 from igps.signature.config import Backend
 
 # Smallest thickness, twice the area over the squared longest edge, of a face without mollified edge lengths.
@@ -55,26 +55,26 @@ def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:
     edges = np.roll(corners, -2, axis=1) - following
     squared = np.einsum("fij,fij->fi", edges, edges)
     normals = np.cross(edges[:, 0], edges[:, 1])
-    double_area = np.linalg.norm(normals, axis=1)
+    double_area = lengths(normals)
     is_thin = double_area <= _MIN_THICKNESS * squared.max(axis=1)
     if is_thin.any():
         # Intrinsic mollification (Sharp and Crane 2020) of the degenerate faces alone: the cotangent matrix stays
         # positive semi-definite, and a vertex whose faces all have zero area keeps a positive mass.
-        longest = np.sqrt(squared[is_thin].max(axis=1, keepdims=True))
-        lengths = np.sqrt(squared[is_thin]) + _MOLLIFIER * longest
-        squared[is_thin] = lengths**2
-        double_area[is_thin] = 2 * _areas_by_lengths(lengths)
+        longer = np.sqrt(squared[is_thin])
+        longer += _MOLLIFIER * longer.max(axis=1, keepdims=True)
+        squared[is_thin] = longer**2
+        double_area[is_thin] = 2 * _areas_by_lengths(longer)
     # cot at corner i = (b·b + c·c − a·a) / (4 area), where a is the edge opposite corner i.
     differences = squared.sum(axis=1, keepdims=True) - 2 * squared
     cotangents = differences / (2 * double_area[:, None])
-    n_vertices = len(mesh.vertices)
-    mass = _mixed_voronoi_mass(mesh.faces, cotangents, squared, double_area / 2, n_vertices)
-    return _stiffness(mesh.faces, cotangents, n_vertices), mass
+    stiffness = _stiffness(mesh, cotangents)
+    mass = _mixed_voronoi_mass(mesh, cotangents, squared, double_area[:, None] / 2)
+    return stiffness, mass
 
 
-def _areas_by_lengths(lengths: Floats) -> Floats:
+def _areas_by_lengths(sides: Floats) -> Floats:
     """Return areas by Heron's formula in Kahan's arrangement, which is stable for needles."""
-    shortest, middle, longest = np.sort(lengths, axis=1).T
+    shortest, middle, longest = np.sort(sides, axis=1).T
     difference = longest - middle
     product = longest + (middle + shortest)
     product = product * (shortest - difference)
@@ -83,27 +83,27 @@ def _areas_by_lengths(lengths: Floats) -> Floats:
     return np.sqrt(product) / 4
 
 
-def _stiffness(faces: Integers, cotangents: Floats, n_vertices: int) -> sparse.csr_matrix:
+def _stiffness(mesh: Mesh, cotangents: Floats) -> sparse.csr_matrix:
     # Half of each corner's cotangent belongs to the edge opposite it. Enter it at one of the edge's two entries.
-    starts = faces[:, [1, 2, 0]].ravel()
-    ends = faces[:, [2, 0, 1]].ravel()
-    shape = (n_vertices, n_vertices)
-    halves = sparse.csr_matrix((cotangents.ravel() / 2, (starts, ends)), shape=shape)
+    starts = np.roll(mesh.faces, -1, axis=1)
+    ends = np.roll(mesh.faces, -2, axis=1)
+    edges = (starts.ravel(), ends.ravel())
+    n_vertices = len(mesh.vertices)
+    halves = sparse.csr_matrix((cotangents.ravel() / 2, edges), shape=(n_vertices, n_vertices))
     weights = halves + halves.T
-    row_sums = np.asarray(weights.sum(axis=1)).ravel()
-    return sparse.diags(row_sums, format="csr") - weights
+    row_sums = np.asarray(weights.sum(axis=1))
+    return sparse.diags(row_sums.ravel(), format="csr") - weights
 
 
-def _mixed_voronoi_mass(
-    faces: Integers, cotangents: Floats, squared: Floats, area: Floats, n_vertices: int
-) -> Floats:
+def _mixed_voronoi_mass(mesh: Mesh, cotangents: Floats, squared: Floats, area: Floats) -> Floats:
     # Meyer et al. 2002, section 3.3. The Voronoi area of corner i is the sum of edge² · cot / 8 over the two edges
     # at i, with the angle opposite the edge. In an obtuse face the corners get fixed shares of the area instead.
     share = squared * cotangents / 8
     voronoi = share.sum(axis=1, keepdims=True) - share
-    obtuse = cotangents < 0
-    fixed = np.where(obtuse, area[:, None] / 2, area[:, None] / 4)
-    corner_areas = np.where(obtuse.any(axis=1, keepdims=True), fixed, voronoi)
-    mass = np.zeros(n_vertices)
-    np.add.at(mass, faces, corner_areas)
+    is_obtuse = cotangents < 0
+    fixed = np.where(is_obtuse, area / 2, area / 4)
+    has_obtuse = is_obtuse.any(axis=1, keepdims=True)
+    corner_areas = np.where(has_obtuse, fixed, voronoi)
+    mass = np.zeros(len(mesh.vertices))
+    np.add.at(mass, mesh.faces, corner_areas)
     return mass

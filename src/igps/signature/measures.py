@@ -120,7 +120,7 @@ def measures(mesh: Mesh, points: Floats | None = None) -> dict[str, float]:
     if points is None:
         points = interior_samples(mesh, min_samples=_N_THICKNESS_POINTS)
     thickness = local_thickness(mesh, points)
-    edges, edge_of = undirected_edges(mesh.faces, len(mesh.vertices))
+    edges, edge_of = undirected_edges(mesh.faces)
     total_curvature = _total_mean_curvature(mesh, edge_of)
     numbers = {
         "volume": volume,

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import face_areas
+from igps.mesh.surface import TINY, face_areas, lengths
 
 # λ·area at which the weights of the embedding have fallen to 1/e of those of the commute time. The eigenfunctions from
 # the 60th on are then negligible, and a multiplet may be cut off at the end.
@@ -59,15 +59,14 @@ def spatial_ordering_keys(mesh: Mesh) -> Floats:
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     centroid = areas @ centres / areas.sum()
     embedding = mesh.vertices - centroid
-    embedding /= np.linalg.norm(embedding, axis=1).max()
+    embedding /= lengths(embedding).max()
     return _keys(embedding, vertex_area_shares(mesh.faces, areas))
 
 
 def in_canonical_order(mesh: Mesh) -> Mesh:
     """Return the mesh with vertices, faces and first corners of faces in an order independent of their numbering."""
     order = np.argsort(spatial_ordering_keys(mesh), kind="stable")
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
+    rank = np.argsort(order)
     corners = rank[mesh.faces]
     first = corners.argmin(axis=1)[:, None]
     turned = (first + np.arange(3)) % 3
@@ -77,11 +76,11 @@ def in_canonical_order(mesh: Mesh) -> Mesh:
 
 
 def _keys(embedding: Floats, tie_breakers: Floats | float) -> Floats:
-    keys = np.linalg.norm(embedding, axis=1) + _TIE_BREAKER_WEIGHT * tie_breakers
+    keys = lengths(embedding) + _TIE_BREAKER_WEIGHT * tie_breakers
     anchor = int(np.argmax(keys))
     nearest = np.full(len(keys), np.inf)
     for weight in _ANCHOR_WEIGHTS:
-        distance = np.linalg.norm(embedding - embedding[anchor], axis=1)
+        distance = lengths(embedding - embedding[anchor])
         keys += weight * distance
         nearest = np.minimum(nearest, distance)
         # The nearest distance alone may be the same for two points that differ in the distances from other anchors.
@@ -94,7 +93,7 @@ def nearest_spacing(points: Floats) -> Floats:
     n_neighbours = min(_N_NEIGHBOURS + 1, len(points))
     distances, _ = cKDTree(points).query(points, n_neighbours)
     spacing = distances.reshape(len(points), n_neighbours).mean(axis=1)
-    return spacing / max(spacing.mean(), np.finfo(float).tiny)
+    return spacing / max(spacing.mean(), TINY)
 
 
 def vertex_area_shares(faces: Integers, areas: Floats) -> Floats:
@@ -123,10 +122,12 @@ def spatial_order(points: Floats, size: int) -> Integers:
     It is found by median cuts: the points of each bounding box are repeatedly halved along its longest side.
     """
     n_points = len(points)
-    n_cuts = max(0, math.ceil(math.log2(max(1, n_points) / size)))
+    if not n_points:
+        return np.empty(0, np.int64)
+    n_cuts = max(0, math.ceil(math.log2(n_points / size)))
     order = np.minimum(np.arange(size << n_cuts), n_points)
     # Index n_points is padding: the mean point for bounding boxes, behind all others for cuts.
-    padding = points.mean(axis=0) if n_points else np.zeros(3)
+    padding = points.mean(axis=0)
     padded = np.ascontiguousarray(np.vstack([points, padding]).T)
     for cut in range(n_cuts):
         n_boxes = 1 << cut

@@ -25,7 +25,8 @@ class SurfacePoints:
 
     def interpolate(self, values: Floats) -> Floats:
         """Return the linear interpolation (P, D) of values (V, D) at the vertices."""
-        return np.einsum("pi,pid->pd", self.weights, values[self.mesh.faces[self.face]])
+        corners = self.mesh.faces[self.face]
+        return np.einsum("pi,pid->pd", self.weights, values[corners])
 
 
 def surface_points(
@@ -37,13 +38,14 @@ def surface_points(
     numbering. One point is then drawn in each of `n_points` equal parts of the area, and the points are in that order.
     """
     generator = np.random.default_rng(seed)
-    area = face_areas(mesh.vertices, mesh.faces)
+    areas = face_areas(mesh.vertices, mesh.faces)
     if keys is None:
-        face = generator.choice(len(area), size=n_points, p=area / area.sum())
+        face = generator.choice(len(areas), size=n_points, p=areas / areas.sum())
         return SurfacePoints(mesh, face, _in_triangles(n_points, generator))
     corner_keys = keys[mesh.faces]
     order = np.argsort(corner_keys.sum(axis=1), kind="stable")
-    face = order[systematic_sample(area[order], n_points, generator)]
+    drawn = systematic_sample(areas[order], n_points, generator)
+    face = order[drawn]
     corner_order = np.argsort(corner_keys, axis=1)[face]
     weights = np.empty((n_points, 3))
     np.put_along_axis(weights, corner_order, _in_triangles(n_points, generator), axis=1)

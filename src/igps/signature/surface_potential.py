@@ -14,7 +14,7 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 from igps._compiled import compiled
-from igps.mesh.surface import longest_side
+from igps.mesh.surface import has_area, lengths, longest_side
 
 Vector = tuple[float, float, float]
 
@@ -36,19 +36,12 @@ def surface_potential(
     centre = corners.mean(axis=(0, 1))
     scale = longest_side(vertices)
     corners = (corners - centre) / scale
-    corners = corners[_relative_heights(corners) > _MIN_HEIGHT]
-    x = np.ascontiguousarray((np.asarray(points, np.float64) - centre).T / scale)
-    potentials = np.zeros(x.shape[1])
-    _fill_potentials(x, _series(corners, accuracy), corners, potentials)
+    corners = corners[has_area(corners, _MIN_HEIGHT)]
+    x = (np.asarray(points, np.float64) - centre) / scale
+    potentials = np.zeros(len(x))
+    series = _series(corners, accuracy)
+    _fill_potentials(np.ascontiguousarray(x.T), series, corners, potentials)
     return potentials * scale
-
-
-def _relative_heights(corners: Floats) -> Floats:
-    """Return the height of each triangle (F, 3, 3) over its longest side."""
-    sides = np.roll(corners, -1, axis=1) - corners
-    double_areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    squared_lengths = np.square(sides).sum(axis=2)
-    return double_areas / squared_lengths.max(axis=1)
 
 
 def _series(corners: Floats, accuracy: float) -> Floats:
@@ -62,7 +55,7 @@ def _series(corners: Floats, accuracy: float) -> Floats:
     first = arms[:, 0] - arms[:, 1]
     second = arms[:, 0] - arms[:, 2]
     normals = np.cross(first, second)
-    areas = np.linalg.norm(normals, axis=1, keepdims=True) / 2
+    areas = lengths(normals)[:, None] / 2
     covariances = arms.transpose(0, 2, 1) @ arms / 12
     variances = np.trace(covariances, axis1=1, axis2=2)
     radii = np.linalg.norm(arms, axis=2).max(axis=1)
@@ -72,8 +65,10 @@ def _series(corners: Floats, accuracy: float) -> Floats:
     limits = np.square(bounds + radii / 2)
     round_parts = variances[:, None, None] * np.eye(3)
     forms = 1.5 * covariances - 0.5 * round_parts
-    entries = forms[:, (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)] * [1, 1, 1, 2, 2, 2]
-    return np.concatenate([centres, limits[:, None], areas, areas * entries], axis=1)
+    diagonals = np.diagonal(forms, axis1=1, axis2=2)
+    mixed = 2 * forms[:, (0, 0, 1), (1, 2, 2)]
+    columns = [centres, limits[:, None], areas, areas * diagonals, areas * mixed]
+    return np.concatenate(columns, axis=1)
 
 
 @compiled()

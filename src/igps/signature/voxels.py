@@ -1,5 +1,7 @@
 """Cells of a cubic grid inside a surface: scan lines along three axes, and winding numbers where these disagree."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +34,7 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
     """
     check_at_least(1, resolution=resolution)
     check_at_least(0, min_samples=min_samples)
-    max_resolution = _largest_resolution(mesh)
+    max_resolution = _max_resolution(mesh)
     if resolution > max_resolution:
         raise MeshError(
             f"{mesh.name}: expected a resolution of at most {max_resolution} ({_MAX_RESOLUTION} cells along the "
@@ -41,12 +43,12 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
     least = max(min_samples, 1)
     while True:
         axes = grid_axes(mesh, resolution)
-        n_x, n_y, n_z = (len(axis) for axis in axes)
-        check_grid(n_x * n_y * n_z, mesh.name)
+        n_cells = math.prod(map(len, axes))
+        check_grid(n_cells, mesh.name)
         inside = inside_grid(mesh, axes)
         count = int(inside.sum())
         if count >= least:
-            return _points_of(axes, np.nonzero(inside))
+            return _centres(axes, inside)
         if min_samples == 0 or resolution >= max_resolution:
             remedy = "raise the resolution, or set min_samples to refine it"
             if min_samples:
@@ -60,18 +62,20 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
         # Therefore `min_samples` is approached from below, by factors of 1.05 to 2.
         growth = (min_samples / max(count, 1)) ** (1 / 3)
         factor = min(max(growth, 1.05), 2.0)
-        resolution = min(int(np.ceil(resolution * factor)), max_resolution)
+        resolution = min(math.ceil(resolution * factor), max_resolution)
 
 
-def _points_of(axes: tuple[Floats, ...], cells: tuple[Integers, ...]) -> Floats:
-    """Return the centres (P, 3) of cells, given by their indices along each axis."""
-    coordinates = [axis[index] for axis, index in zip(axes, cells, strict=True)]
-    return np.stack(coordinates, axis=1)
+def _centres(axes: tuple[Floats, ...], is_chosen: Booleans) -> Floats:
+    """Return the centres (P, 3) of the chosen cells (X, Y, Z)."""
+    x_axis, y_axis, z_axis = axes
+    x, y, z = np.nonzero(is_chosen)
+    return np.stack([x_axis[x], y_axis[y], z_axis[z]], axis=1)
 
 
-def _largest_resolution(mesh: Mesh) -> int:
+def _max_resolution(mesh: Mesh) -> int:
     """Return the largest resolution whose grid is within the limits."""
-    sides = box_sides(mesh.vertices) / longest_side(mesh.vertices)
+    sides = box_sides(mesh.vertices)
+    sides = sides / sides.max()
     resolution = _MAX_RESOLUTION
     while np.prod(np.ceil(sides * resolution).clip(1)) > _MAX_CELLS:
         resolution -= 1
@@ -102,23 +106,22 @@ def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
     agree with the winding number. If a line passes through a hole, the other five sums outvote its sum; if more
     disagree, the winding number is computed from solid angles (Jacobson et al. 2013). Surface points are outside.
     """
-    shape = tuple(len(axis) for axis in axes)
+    shape = tuple(map(len, axes))
     votes = np.zeros(shape, dtype=np.int8)
     on_surface = np.zeros(shape, dtype=bool)
-    for i in range(3):
-        order = (i, (i + 1) % 3, (i + 2) % 3)
-        line = tuple(axes[k] for k in order)
-        after, before, touching = _scan(mesh.vertices[:, order], mesh.faces, line)
-        inverse = np.argsort(order)
-        agreeing = (after > 0).astype(np.int8) + (before > 0)
-        votes += agreeing.transpose(inverse)
-        on_surface |= touching.transpose(inverse)
+    for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        first, second, third = order
+        scanned = (axes[first], axes[second], axes[third])
+        after, before, touching = _scan(mesh.vertices[:, order], mesh.faces, scanned)
+        back = np.argsort(order)
+        votes += (after > 0).transpose(back)
+        votes += (before > 0).transpose(back)
+        on_surface |= touching.transpose(back)
     inside = votes >= 5
     is_doubtful = (votes > 1) & (votes < 5) & ~on_surface
-    doubtful = np.nonzero(is_doubtful)
     if is_doubtful.any():
-        points = _points_of(axes, doubtful)
-        inside[doubtful] = winding_number(mesh.vertices, mesh.faces, points) > 0.5
+        points = _centres(axes, is_doubtful)
+        inside[is_doubtful] = winding_number(mesh.vertices, mesh.faces, points) > 0.5
     return inside & ~on_surface
 
 
@@ -135,46 +138,42 @@ def _scan(
     # Rows: where each edge crosses each plane z = const, half-open in z. The edge runs from its lower to its upper end
     # whatever the face, so both faces compute the same point.
     start, end = directed_edges(faces)
-    upward = vertices[start, 2] < vertices[end, 2]
-    low = np.where(upward, start, end)
-    high = np.where(upward, end, start)
-    first = np.searchsorted(z_axis, vertices[low, 2], side="left")
-    last = np.searchsorted(z_axis, vertices[high, 2], side="left")
+    is_upward = vertices[start, 2] < vertices[end, 2]
+    low = vertices[np.where(is_upward, start, end)]
+    high = vertices[np.where(is_upward, end, start)]
+    first = np.searchsorted(z_axis, low[:, 2])
+    last = np.searchsorted(z_axis, high[:, 2])
     half_edge, row = _ranges(first, last)
-    a = vertices[low[half_edge]]
-    b = vertices[high[half_edge]]
-    edge = b - a
+    a = low[half_edge]
+    edge = high[half_edge] - a
     t = (z_axis[row] - a[:, 2]) / edge[:, 2]
     x = a[:, 0] + t * edge[:, 0]
     y = a[:, 1] + t * edge[:, 1]
-    # A plane that crosses a face crosses exactly two of its edges, one upward and one downward:
-    # pair them.
-    order = np.lexsort((upward[half_edge], row, half_edge // 3))
+    # A plane that crosses a face crosses exactly two of its edges, one upward and one downward: pair them.
+    order = np.lexsort((is_upward[half_edge], row, half_edge // 3))
     down = order[0::2]
     up = order[1::2]
     row = row[up]
 
     # Columns: the points of each such segment on the lines y = const, half-open in y.
-    column_down = np.searchsorted(y_axis, y[down], "left")
-    column_up = np.searchsorted(y_axis, y[up], "left")
+    column_down = np.searchsorted(y_axis, y[down])
+    column_up = np.searchsorted(y_axis, y[up])
     first = np.minimum(column_down, column_up)
     last = np.maximum(column_down, column_up)
     segment, column = _ranges(first, last)
     row = row[segment]
-    # +1 where the outward normal points towards +x: seen from there, the upward edge has the
-    # larger y.
-    sign = np.where(column_up > column_down, 1, -1)[segment].astype(np.int32)
+    # +1 where the outward normal points towards +x: seen from there, the upward edge has the larger y.
+    signs = np.where(column_up > column_down, 1, -1)[segment]
     down = down[segment]
     up = up[segment]
     t = (y_axis[column] - y[down]) / (y[up] - y[down])
     crossing = x[down] + t * (x[up] - x[down])
 
-    # A crossing counts for all points of its line with smaller x: enter it where their suffix sum
-    # starts.
-    position = np.searchsorted(x_axis, crossing, "left")
+    # A crossing counts for all points of its line with smaller x: enter it where their suffix sum starts.
+    position = np.searchsorted(x_axis, crossing)
     size = (len(x_axis) + 1, len(y_axis), len(z_axis))
     flat = np.ravel_multi_index((position, column, row), size)
-    counts = np.bincount(flat, weights=sign, minlength=int(np.prod(size)))
+    counts = np.bincount(flat, weights=signs, minlength=math.prod(size))
     crossings = counts.reshape(size).astype(np.int32)
     # The points with smaller x than a crossing have indices below its position.
     from_end = np.cumsum(crossings[::-1], axis=0)
@@ -184,9 +183,9 @@ def _scan(
     on_surface = np.zeros(size, dtype=bool)
     cell = _cell_size(axes, vertices)
     for neighbour in (position - 1, position):
-        clipped = np.clip(neighbour, 0, len(x_axis) - 1)
-        is_close = np.abs(x_axis[clipped] - crossing) < _ON_SURFACE * cell
-        on_surface[clipped[is_close], column[is_close], row[is_close]] = True
+        neighbour = np.clip(neighbour, 0, len(x_axis) - 1)
+        is_close = np.abs(x_axis[neighbour] - crossing) < _ON_SURFACE * cell
+        on_surface[neighbour[is_close], column[is_close], row[is_close]] = True
     return after, before, on_surface[:-1]
 
 
@@ -200,7 +199,8 @@ def _cell_size(axes: tuple[Floats, ...], vertices: Floats) -> float:
 
 def _ranges(first: Integers, last: Integers) -> tuple[Integers, Integers]:
     """Return all pairs (i, k) with first[i] ≤ k < last[i], in order."""
-    length = np.maximum(last - first, 0)
-    owner = np.repeat(np.arange(len(first)), length)
-    start = np.cumsum(length) - length
-    return owner, np.arange(len(owner)) - start[owner] + first[owner]
+    lengths = np.maximum(last - first, 0)
+    owner = np.repeat(np.arange(len(first)), lengths)
+    starts = np.cumsum(lengths) - lengths
+    shifts = first - starts
+    return owner, np.arange(len(owner)) + shifts[owner]

@@ -29,7 +29,8 @@ class Basis:
     def __init__(self, first_row: np.ndarray, capacity: int, team: Team = SERIAL) -> None:
         self._team = team
         n_columns = len(first_row)
-        self._pieces = split(n_columns, max(1, min(MAX_PIECES, n_columns // MIN_PIECE_COLUMNS)))
+        n_pieces = min(MAX_PIECES, n_columns // MIN_PIECE_COLUMNS)
+        self._pieces = split(n_columns, max(1, n_pieces))
         self.overwrites_basis = (capacity + 1) * n_columns > MAX_SINGLE_ENTRIES
         # Reading single precision takes half the time.
         self._single: torch.Tensor | None
@@ -50,37 +51,34 @@ class Basis:
             self._basis = torch.from_numpy(self._memory)
             self._single = None
         elif n_rows * n_columns <= MAX_HUGE_PAGE_ENTRIES:
-            self._basis, self._single = (
-                torch.from_numpy(np.empty(shape, dtype)) for dtype in (np.float64, np.float32)
-            )
+            self._basis = torch.from_numpy(np.empty(shape, np.float64))
+            self._single = torch.from_numpy(np.empty(shape, np.float32))
         else:
             self._basis = torch.empty(shape, dtype=torch.float64, device="cpu")
             self._single = torch.empty(shape, dtype=torch.float32, device="cpu")
 
-    def _sum_pieces(
-        self, function: Callable[[slice], tuple[torch.Tensor, ...]]
-    ) -> tuple[torch.Tensor, ...]:
+    def _sum_pieces(self, function: Callable[[slice], torch.Tensor]) -> torch.Tensor:
         """Call a function for each piece of the columns, and add its results in the order of the pieces."""
-        totals, *others = self._team.each(function, self._pieces)
-        for parts in others:
-            for total, part in zip(totals, parts, strict=True):
-                total.add_(part)
-        return totals
+        total, *others = self._team.each(function, self._pieces)
+        for part in others:
+            total.add_(part)
+        return total
 
     def _next_rows(self, n_rows: int) -> torch.Tensor:
         """Return the free rows to which the next block is written; the basis is enlarged if necessary."""
         stop = self._stop + n_rows
         if stop > len(self._basis):
             capacity = len(self._basis) * 3 // 2 + n_rows
+            filled = slice(self._stop)
             basis = self._basis
             single = self._single
             projected = self._projected
             self._allocate(capacity, basis.shape[1])
-            self._basis[: self._stop] = basis[: self._stop]
+            self._basis[filled] = basis[filled]
             if self._single is not None and single is not None:
                 self._single[: self._n_orthogonal] = single[: self._n_orthogonal]
             self._projected = projected.new_zeros(capacity, capacity)
-            self._projected[: self._stop, : self._stop] = projected[: self._stop, : self._stop]
+            self._projected[filled, filled] = projected[filled, filled]
         return self._basis[self._stop : stop]
 
     def _append(self, block: torch.Tensor, *, is_orthogonal: bool) -> None:

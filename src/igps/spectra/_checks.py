@@ -19,6 +19,13 @@ def canonical(matrix: sparse.csr_array) -> sparse.csr_array:
     return matrix
 
 
+def pattern(matrix: sparse.csr_array) -> tuple[np.ndarray, np.ndarray]:
+    """Return the starts of the rows (V + 1,) and the columns (E,) of the entries of a matrix, as int32."""
+    starts = matrix.indptr.astype(np.int32, copy=False)
+    columns = matrix.indices.astype(np.int32, copy=False)
+    return starts, columns
+
+
 def checked_entries(
     matrix: sparse.csr_array, indptr: np.ndarray, indices: np.ndarray
 ) -> sparse.csr_array:
@@ -108,11 +115,9 @@ def _significant(stiffness: sparse.csr_array) -> sparse.csr_array:
     """Return the matrix without entries that are rounding errors of zero, which would connect components."""
     entries = stiffness.tocoo()
     diagonal = stiffness.diagonal()
-    large = np.abs(entries.data) > ROUNDING * np.minimum(
-        diagonal[entries.row], diagonal[entries.col]
-    )
-    if large.all():
+    smaller = np.minimum(diagonal[entries.row], diagonal[entries.col])
+    is_large = np.abs(entries.data) > ROUNDING * smaller
+    if is_large.all():
         return stiffness
-    return sparse.csr_array(
-        (entries.data[large], (entries.row[large], entries.col[large])), shape=stiffness.shape
-    )
+    ends = (entries.row[is_large], entries.col[is_large])
+    return sparse.csr_array((entries.data[is_large], ends), shape=stiffness.shape)

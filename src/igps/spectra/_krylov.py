@@ -12,7 +12,7 @@ from scipy.linalg import qr
 from igps._threads import SERIAL, Team
 from igps.spectra._basis import Basis, split
 from igps.spectra._checks import ROUNDING
-from igps.spectra._products import overlaps, subtract
+from igps.spectra._products import identity, overlaps, subtract
 from igps.spectra.multifrontal import Factors
 
 # Smallest pivot, relative to the longest row, for which a Cholesky factor is accurate.
@@ -23,7 +23,8 @@ MIN_QUICK_PIVOT = 1e-4
 # Smallest pivot, relative to the largest, for which one Cholesky factor makes rows orthonormal up to rounding.
 MIN_ONE_PASS_PIVOT = 0.1
 # Number of blocks between two reorthogonalisations; it becomes 1 after a loss of orthogonality above MAX_LOSS.
-INTERVAL, MAX_LOSS = 2, 1e-7
+INTERVAL = 2
+MAX_LOSS = 1e-7
 # Largest loss of orthogonality that is removed in single precision.
 MAX_SINGLE_LOSS = 3e-8
 # Number of columns of the basis that are turned into eigenvectors at a time.
@@ -43,12 +44,13 @@ class RitzPairs:
 
     def leading(self, n_below: int, tolerance: float) -> torch.Tensor:
         """Return the indices of the pairs before the first unconverged one; none unless n_below of them lie below σ."""
-        is_converged = (self.residuals <= tolerance * self.eigenvalues) & (self.eigenvalues > 0)
+        is_converged = self.residuals <= tolerance * self.eigenvalues
+        is_converged &= self.eigenvalues > 0
         below = torch.nonzero(is_converged & self.below_shift).flatten()
         if len(below) < n_below:
             return below[:0]
         above = torch.nonzero(~self.below_shift).flatten()
-        n_above = int(torch.cumprod(is_converged[above].int(), 0).sum())
+        n_above = int(is_converged[above].int().cumprod(0).sum())
         return torch.cat([below, above[:n_above]])
 
 
@@ -75,11 +77,11 @@ class Krylov(Basis):
         # Rows _previous:_current and _current:_stop of the basis are the last two blocks; the last awaits `expand`.
         self._previous = self._current = 1
         self._interval = INTERVAL
-        self._coupling = torch.empty(0, 0, dtype=torch.float64, device="cpu")
+        self._coupling = identity(0)
         # Random vectors consist mostly of high frequencies, which one application of the operator removes.
-        self._append(
-            self._orthonormal(self._apply(self._random(block_size)), near=1)[0], is_orthogonal=True
-        )
+        start = self._apply(self._random(block_size))
+        block, _ = self._orthonormal(start, near=1)
+        self._append(block, is_orthogonal=True)
 
     @property
     def size(self) -> int:
@@ -91,53 +93,57 @@ class Krylov(Basis):
         last = slice(self._current, self._stop)
         near = self._basis[self._previous : self._stop]
         product = self._apply(self._basis[last])
-        (projection,) = self._sum_pieces(lambda piece: (overlaps(product, near, piece),))
+        projection = self._sum_pieces(lambda piece: overlaps(product, near, piece))
         diagonal = projection[:, self._current - self._previous :]
 
-        def project_out(piece: slice) -> tuple[torch.Tensor]:
+        def project_out(piece: slice) -> torch.Tensor:
             product[:, piece].addmm_(projection, near[:, piece], alpha=-1)
-            return (overlaps(product, product, piece),)
+            return overlaps(product, product, piece)
 
-        (remainder,) = self._sum_pieces(project_out)
+        remainder = self._sum_pieces(project_out)
         # Length of the longest row of the product, from its projection and its remainder, by Pythagoras' theorem.
-        scale = math.sqrt(float((remainder.diagonal() + projection.square().sum(1)).max()))
+        squares = remainder.diagonal() + projection.square().sum(1)
+        scale = math.sqrt(float(squares.max()))
         quick = self._factor_quickly(product, remainder, scale)
         if quick is None:
             self._reorthogonalise()
         block, coupling = quick or self._orthonormal(product, near=self._previous, scale=scale)
         self._projected[last, last] = (diagonal + diagonal.T) / 2
-        self._previous, self._current = self._current, self._stop
+        self._previous = self._current
+        self._current = self._stop
         self._append(block, is_orthogonal=quick is None)
         new = slice(self._current, self._stop)
         self._projected[new, last] = coupling
         self._projected[last, new] = coupling.T
         self._coupling = coupling
-        if (
-            self._stop - self._n_orthogonal >= self._interval * len(block)
-            and self._reorthogonalise() > MAX_LOSS
-        ):
-            self._interval = 1
+        n_waiting = self._stop - self._n_orthogonal
+        if n_waiting >= self._interval * len(block):
+            loss = self._reorthogonalise()
+            if loss > MAX_LOSS:
+                self._interval = 1
 
     def widen(self) -> None:
         """Enlarge the last block, and those after it, by random vectors, for directions that the start block lacked."""
         self._reorthogonalise()
         block, _ = self._orthonormal(self._random(self._block_size), near=self._previous)
         self._append(block, is_orthogonal=True)
-        self._coupling = torch.cat(
-            [self._coupling, self._coupling.new_zeros(len(block), self._coupling.shape[1])]
-        )
+        uncoupled = self._coupling.new_zeros(len(block), self._coupling.shape[1])
+        self._coupling = torch.cat([self._coupling, uncoupled])
 
     def ritz_pairs(self, shift: float) -> RitzPairs:
         self._reorthogonalise()
         rows = slice(1, self._current)
         theta, coefficients = torch.linalg.eigh(self._projected[rows, rows])
-        next_coefficients = self._coupling @ coefficients[-self._coupling.shape[1] :]
         eigenvalues = shift + 1 / theta
         order = torch.argsort(eigenvalues)
+        of_last_block = coefficients[-self._coupling.shape[1] :]
+        of_next_block = self._coupling @ of_last_block
+        residuals = torch.linalg.norm(of_next_block, dim=0) / theta**2
+        coefficients = torch.cat([coefficients, of_next_block / theta])
         return RitzPairs(
             eigenvalues=eigenvalues[order],
-            residuals=(torch.linalg.norm(next_coefficients, dim=0) / theta**2)[order],
-            coefficients=torch.cat([coefficients, next_coefficients / theta])[:, order],
+            residuals=residuals[order],
+            coefficients=coefficients[:, order],
             below_shift=(theta < 0)[order],
         )
 
@@ -149,12 +155,12 @@ class Krylov(Basis):
         The steps may run in any order. Entry i of a vector becomes row ``order[i]``.
         """
         coefficients = _coefficients(ritz, index).numpy()
-        vectors = torch.empty(
-            self._basis.shape[1], len(index), dtype=torch.float64, device="cpu"
-        ).numpy()
+        shape = (self._basis.shape[1], len(index))
+        vectors = torch.empty(shape, dtype=torch.float64, device="cpu").numpy()
 
         def combine(piece: slice) -> None:
-            vectors[order[piece]] = self._basis[1 : self._stop, piece].numpy().T @ coefficients
+            rows = self._basis[1 : self._stop, piece].numpy()
+            vectors[order[piece]] = rows.T @ coefficients
 
         return vectors, [partial(combine, piece) for piece in self._small_pieces()]
 
@@ -166,7 +172,8 @@ class Krylov(Basis):
         n_vertices = self._basis.shape[1]
         n_vectors = coefficients.shape[1]
         for piece in self._small_pieces():
-            self._basis[:n_vectors, piece] = coefficients.T @ self._basis[1 : self._stop, piece]
+            combined = coefficients.T @ self._basis[1 : self._stop, piece]
+            self._basis[:n_vectors, piece] = combined
         rows = self._memory
         self._basis = self._basis.new_empty(0, n_vertices)
         self._memory = np.empty((0, n_vertices))
@@ -179,10 +186,11 @@ class Krylov(Basis):
 
     def _small_pieces(self) -> list[slice]:
         n_vertices = self._basis.shape[1]
-        return split(n_vertices, -(-n_vertices // PIECE_COLUMNS))
+        return split(n_vertices, math.ceil(n_vertices / PIECE_COLUMNS))
 
     def _random(self, n_rows: int) -> torch.Tensor:
-        return torch.from_numpy(self._generator.standard_normal((n_rows, self._basis.shape[1])))
+        shape = (n_rows, self._basis.shape[1])
+        return torch.from_numpy(self._generator.standard_normal(shape))
 
     def _apply(self, block: torch.Tensor) -> torch.Tensor:
         """Return the products (b, V) of the operator with b rows."""
@@ -201,18 +209,19 @@ class Krylov(Basis):
         new = self._basis[self._n_orthogonal : self._stop]
         if not len(new):
             return 0.0
-        (overlap,) = self._sum_pieces(lambda piece: (overlaps(new, old, piece),))
+        overlap = self._sum_pieces(lambda piece: overlaps(new, old, piece))
         loss = float(overlap.abs().max())
         if self._single is not None and loss <= MAX_SINGLE_LOSS:
             old = self._single[: self._n_orthogonal]
             overlap = overlap.float()
 
-        def remove(piece: slice) -> tuple[torch.Tensor]:
+        def remove(piece: slice) -> torch.Tensor:
             subtract(new, overlap, old, piece)
-            return (overlaps(new, new, piece),)
+            return overlaps(new, new, piece)
 
-        (squares,) = self._sum_pieces(remove)
-        if float((squares - torch.eye(len(new), device="cpu")).abs().max()) > ROUNDING:
+        squares = self._sum_pieces(remove)
+        error = (squares - identity(len(new))).abs().max()
+        if error > ROUNDING:
             self._multiply(_inverse(torch.linalg.cholesky(squares)), new, new)
         self._mark_orthogonal()
         return loss
@@ -225,10 +234,13 @@ class Krylov(Basis):
         According to the recurrence, only rows of the basis from ``near`` on contribute. A second pass, over all rows,
         removes rounding errors. ``scale`` is the length of the longest row before anything was subtracted from it.
         """
-        scale = float(torch.linalg.norm(block, dim=1).max()) if scale is None else scale
-        coupling = torch.eye(len(block), dtype=torch.float64, device="cpu")
-        for rows in (self._basis[near : self._stop], self._basis[: self._stop]):
-            block = torch.addmm(block, (rows @ block.T).T, rows, alpha=-1)
+        if scale is None:
+            scale = float(torch.linalg.norm(block, dim=1).max())
+        coupling = identity(len(block))
+        for first in (near, 0):
+            rows = self._basis[first : self._stop]
+            projection = (rows @ block.T).T
+            block = torch.addmm(block, projection, rows, alpha=-1)
             block, factor = self._factor_rows(block, scale)
             coupling = factor @ coupling
             scale = 1.0
@@ -244,10 +256,10 @@ class Krylov(Basis):
         r[is_lost] = 0
         rows = torch.from_numpy(np.ascontiguousarray(q.T))
         if is_lost.any():
-            rows[torch.from_numpy(is_lost)] = self._random(int(is_lost.sum())) / math.sqrt(
-                block.shape[1]
-            )
-        return rows, torch.from_numpy(r[:, np.argsort(order)])
+            substitutes = self._random(int(is_lost.sum()))
+            rows[torch.from_numpy(is_lost)] = substitutes / math.sqrt(block.shape[1])
+        unsorted = r[:, np.argsort(order)]
+        return rows, torch.from_numpy(unsorted)
 
     def _factor_quickly(
         self, block: torch.Tensor, squares: torch.Tensor, scale: float
@@ -264,7 +276,7 @@ class Krylov(Basis):
         self._multiply(_inverse(first), block, rows)
         if smallest > MIN_ONE_PASS_PIVOT * largest:
             return rows, first.T
-        (squares,) = self._sum_pieces(lambda piece: (overlaps(rows, rows, piece),))
+        squares = self._sum_pieces(lambda piece: overlaps(rows, rows, piece))
         second = torch.linalg.cholesky(squares)
         self._multiply(_inverse(second), rows, rows)
         return rows, second.T @ first.T
@@ -278,6 +290,4 @@ def _coefficients(ritz: RitzPairs, index: torch.Tensor) -> torch.Tensor:
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:
     """Return the inverse of a lower triangular matrix."""
-    return torch.linalg.solve_triangular(
-        factor, torch.eye(len(factor), dtype=factor.dtype, device="cpu"), upper=False
-    )
+    return torch.linalg.solve_triangular(factor, identity(len(factor)), upper=False)

@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
 from igps._compiled import compiled
-from igps.spectra._checks import canonical
+from igps.spectra._checks import canonical, pattern
 
 # Approximate number of vertices of a part that is not split further. Smaller leaves lead to more and smaller products,
 # larger leaves to more fill-in.
@@ -22,11 +22,12 @@ CUT_WINDOW = 0.05
 
 def hop_coordinates(graph: sparse.csr_array, n_landmarks: int = 3) -> np.ndarray:
     """Return hop distances (V, n_landmarks) to vertices far apart, as coordinates for a graph that has none."""
-    pattern = sparse.csr_array((np.ones(graph.nnz), graph.indices, graph.indptr), shape=graph.shape)
+    ones = np.ones(graph.nnz)
+    unweighted = sparse.csr_array((ones, graph.indices, graph.indptr), shape=graph.shape)
     columns: list[np.ndarray] = []
     landmark = 0
     for _ in range(n_landmarks + 1):
-        hops = dijkstra(pattern, directed=False, indices=landmark, unweighted=True)
+        hops = dijkstra(unweighted, directed=False, indices=landmark, unweighted=True)
         columns.append(np.where(np.isfinite(hops), hops, -1.0))
         # The first landmark is arbitrary. It is dropped once it has led to one at the far end.
         columns = columns[-n_landmarks:]
@@ -73,9 +74,7 @@ def nested_dissection(
     n_vertices = graph.shape[0]
     depth = max(0, int(np.ceil(np.log2(n_vertices / leaf_size))))
     orders = [np.argsort(column, kind="stable") for column in coordinates.T]
-    indptr, indices = (
-        array.astype(np.int32, copy=False) for array in (graph.indptr, graph.indices)
-    )
+    indptr, indices = pattern(graph)
     scratch = _Scratch(
         rank=np.full(n_vertices, -1, np.int32),
         low=np.empty(n_vertices, np.int32),

@@ -32,7 +32,9 @@ def overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Te
 
     For a few long rows NumPy's BLAS takes two thirds of the time of PyTorch's on an AMD processor.
     """
-    return torch.from_numpy(rows.numpy()[:, piece] @ others.numpy()[:, piece].T)
+    columns = rows.numpy()[:, piece]
+    other_columns = others.numpy()[:, piece]
+    return torch.from_numpy(columns @ other_columns.T)
 
 
 def subtract(rows: torch.Tensor, factors: torch.Tensor, others: torch.Tensor, piece: slice) -> None:
@@ -41,6 +43,11 @@ def subtract(rows: torch.Tensor, factors: torch.Tensor, others: torch.Tensor, pi
     The product is NumPy's: its single precision does not depend on PyTorch's setting for matrix products.
     """
     rows.numpy()[:, piece] -= factors.numpy() @ others.numpy()[:, piece]
+
+
+def identity(size: int) -> torch.Tensor:
+    """Return the identity matrix, in double precision on the processor whatever the defaults of PyTorch."""
+    return torch.eye(size, dtype=torch.float64, device="cpu")
 
 
 def _tile(n_columns: int) -> Any:
@@ -56,63 +63,67 @@ def _tile(n_columns: int) -> Any:
     real = ir.DoubleType()
     integer = ir.IntType(64)
     vector = ir.VectorType(real, n_columns) if n_columns > 1 else real
-    fused = ("contract",)
 
     def tile(
-        context: Any, a: Any, x: Any, add: Any, source: Any, out: Any, size: Any, scale: Any
+        context: Any, a: Any, x: Any, is_added: Any, source: Any, out: Any, size: Any, scale: Any
     ) -> Any:
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            operands = []
-            for numba_type, value in zip(signature.args, values, strict=True):
-                is_tuple = isinstance(numba_type, types.BaseTuple)
-                items = cgutils.unpack_tuple(builder, value) if is_tuple else [value]
-                if is_tuple and numba_type is not size:
-                    array = context.make_array(numba_type[0])(context, builder, items[0])
-                    items[0] = builder.gep(array.data, [items[1]])
-                operands.append(items)
-            (a_start, _, a_step, a_stride), x_rows, [is_added], source_rows, out_rows, *rest = (
-                operands
-            )
-            (n_rows, n_terms), [factor] = rest
+            def matrix(number: int) -> list[Any]:
+                """Return the address of the first number of a matrix, and its steps."""
+                array, start, *steps = cgutils.unpack_tuple(builder, values[number])
+                array_type = signature.args[number][0]
+                data = context.make_array(array_type)(context, builder, array).data
+                return [builder.gep(data, [start]), *steps]
+
+            a_start, a_step, a_stride = matrix(0)
+            x_rows = matrix(1)
+            is_added = values[2]
+            source_rows = matrix(3)
+            out_rows = matrix(4)
+            n_rows, n_terms = cgutils.unpack_tuple(builder, values[5])
+            factor = values[6]
 
             def broadcast(value: Any) -> Any:
                 """Fill a vector with a number."""
                 if n_columns == 1:
                     return value
-                first = builder.insert_element(
-                    ir.Constant(vector, ir.Undefined), value, ir.IntType(32)(0)
-                )
-                return builder.shuffle_vector(
-                    first, first, ir.Constant(ir.VectorType(ir.IntType(32), n_columns), None)
-                )
+                first_lane = ir.IntType(32)(0)
+                nothing = ir.Constant(vector, ir.Undefined)
+                first = builder.insert_element(nothing, value, first_lane)
+                lanes = ir.Constant(ir.VectorType(ir.IntType(32), n_columns), None)
+                return builder.shuffle_vector(first, first, lanes)
 
-            def row(operand: Any, index: Any) -> Any:
-                start, _, step = operand
+            def row(rows: list[Any], index: Any) -> Any:
+                start, step = rows
                 place = builder.gep(start, [builder.mul(index, step)])
                 return builder.bitcast(place, vector.as_pointer())
 
+            multiply = partial(builder.fmul, flags=("contract",))
+            add = partial(builder.fadd, flags=("contract",))
             last = builder.sub(n_rows, integer(1))
-            rows = [
-                builder.select(builder.icmp_signed("<", integer(i), last), integer(i), last)
-                for i in range(ROWS)
-            ]
-            columns_of_a = [builder.gep(a_start, [builder.mul(i, a_stride)]) for i in rows]
-            sums = [cgutils.alloca_once_value(builder, ir.Constant(vector, None)) for _ in rows]
+            rows = []
+            columns_of_a = []
+            sums = []
+            for number in range(ROWS):
+                is_left = builder.icmp_signed("<", integer(number), last)
+                i = builder.select(is_left, integer(number), last)
+                rows.append(i)
+                columns_of_a.append(builder.gep(a_start, [builder.mul(i, a_stride)]))
+                sums.append(cgutils.alloca_once_value(builder, ir.Constant(vector, None)))
             with cgutils.for_range(builder, n_terms) as loop:
                 x_row = builder.load(row(x_rows, loop.index), align=8)
                 offset = builder.mul(loop.index, a_step)
                 for column, total in zip(columns_of_a, sums, strict=True):
-                    number = broadcast(builder.load(builder.gep(column, [offset])))
-                    term = builder.fmul(number, x_row, flags=fused)
-                    builder.store(builder.fadd(builder.load(total), term, flags=fused), total)
+                    entry = builder.load(builder.gep(column, [offset]))
+                    term = multiply(broadcast(entry), x_row)
+                    builder.store(add(builder.load(total), term), total)
             factors = broadcast(factor)
-            products = [builder.fmul(builder.load(total), factors, flags=fused) for total in sums]
+            products = [multiply(builder.load(total), factors) for total in sums]
             with builder.if_else(is_added) as (added, alone):
                 with added:
                     addends = [builder.load(row(source_rows, i), align=8) for i in rows]
                     for i, addend, result in zip(rows, addends, products, strict=True):
-                        total = builder.fadd(addend, result, flags=fused)
-                        builder.store(total, row(out_rows, i), align=8)
+                        builder.store(add(addend, result), row(out_rows, i), align=8)
                 with alone:
                     for i, result in zip(rows, products, strict=True):
                         builder.store(result, row(out_rows, i), align=8)

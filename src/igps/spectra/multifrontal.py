@@ -39,9 +39,10 @@ from scipy import sparse
 from igps._arrays import Floats
 from igps._threads import SERIAL, Team
 from igps.spectra import _fronts as loops
-from igps.spectra._checks import checked_entries
+from igps.spectra._checks import checked_entries, pattern
 from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
 from igps.spectra._pivots import Scratch
+from igps.spectra._products import identity
 from igps.spectra.tree import BLOCK, CARRIED, UPDATE, Nodes, Structure, tree_structure
 
 # Largest number of own unknowns of a node that compiled loops handle. PyTorch handles larger nodes, with a team.
@@ -71,7 +72,8 @@ class Tree:
         pivot block is singular, as for a shift at an eigenvalue.
         """
         blocks = np.empty(self.structure.nodes[BLOCK, -1])
-        return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
+        n_negative = self._eliminate(matrix, shift, team, blocks)
+        return Factors(self, blocks, n_negative)
 
     def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = SERIAL) -> int:
         """Return the number of negative eigenvalues of ``matrix − shift · I``, with the errors of `factorize`."""
@@ -80,32 +82,31 @@ class Tree:
     def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:
         """Return the tree and the matrix with unknowns in elimination order, and the former index (V,) of each."""
         order = self.structure.order
-        matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)[order][
-            :, order
-        ]
+        matrix = self._checked(matrix)[order][:, order]
         matrix.sort_indices()
-        indptr, indices = (
-            array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices)
-        )
-        identity = np.arange(len(order))
+        indptr, indices = pattern(matrix)
+        same = np.arange(len(order))
         structure = self.structure._replace(
-            indptr=indptr, indices=indices, order=identity, position=identity
+            indptr=indptr, indices=indices, order=same, position=same
         )
         return replace(self, structure=structure), matrix, order
+
+    def _checked(self, matrix: sparse.csr_array) -> sparse.csr_array:
+        return checked_entries(matrix, self.structure.indptr, self.structure.indices)
 
     def _eliminate(
         self, matrix: sparse.csr_array, shift: float, team: Team, blocks: np.ndarray | None
     ) -> int:
         """Eliminate all nodes, write to `blocks` if given, and return the number of negative eigenvalues."""
-        matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)
-        n_updates = (self.structure.nodes[UPDATE, :-1] + self.structure.n_boundary**2).max()
-        values = matrix.data.astype(np.float64, copy=False)
-        updates = np.empty(n_updates)
+        values = self._checked(matrix).data.astype(np.float64, copy=False)
+        ends = self.structure.nodes[UPDATE, :-1] + self.structure.n_boundary**2
+        updates = np.empty(ends.max())
 
         def eliminate(nodes: Nodes) -> int:
             return self._eliminate_range(nodes, values, float(shift), updates, blocks, team)
 
-        return sum(team.each(eliminate, self.subtrees)) + sum(map(eliminate, self.above))
+        n_negative = sum(team.each(eliminate, self.subtrees))
+        return n_negative + sum(map(eliminate, self.above))
 
     def _eliminate_range(
         self,
@@ -117,12 +118,13 @@ class Tree:
         team: Team,
     ) -> int:
         """Eliminate a range of nodes as `_eliminate`, and write the complements for later nodes to `updates`."""
-        (begin, end), structure = nodes, self.structure
-        own_sizes = structure.n_own[begin:end]
-        boundary_sizes = structure.n_boundary[begin:end]
-        front = np.empty(int((own_sizes + boundary_sizes).max()) ** 2)
+        node, end = nodes
+        structure = self.structure
+        own_sizes = structure.n_own[node:end]
+        widths = own_sizes + structure.n_boundary[node:end]
+        front = np.empty(widths.max() ** 2)
         if blocks is None:  # each block overwrites the previous one
-            blocks = np.empty(int((own_sizes * (own_sizes + boundary_sizes)).max()))
+            blocks = np.empty((own_sizes * widths).max())
             table = structure.nodes.copy()
             table[BLOCK] = 0
             structure = structure._replace(nodes=table)
@@ -130,7 +132,7 @@ class Tree:
         squares = [np.empty(padded**2) for _ in range(3)]
         strips = [np.empty(loops.STEP * (padded + loops.STEP)) for _ in range(2)]
         scratch = Scratch(np.empty(len(structure.order), dtype=np.int64), front, *squares, *strips)
-        n_negative, node = 0, begin
+        n_negative = 0
         while True:
             n_new, node = loops.eliminate(
                 (node, end), MAX_COMPILED, structure, values, shift, updates, blocks, scratch
@@ -138,15 +140,13 @@ class Tree:
             n_negative += n_new
             if node == end:
                 return n_negative
-            n_own = int(own_sizes[node - begin])
-            n_boundary = int(boundary_sizes[node - begin])
+            n_own = int(structure.n_own[node])
+            n_boundary = int(structure.n_boundary[node])
             width = n_own + n_boundary
-            block = blocks[structure.nodes[BLOCK, node] :]
-            update = updates[structure.nodes[UPDATE, node] :]
             n_negative += _eliminate_node(
-                torch.from_numpy(front[: width**2].reshape(width, width)),
-                torch.from_numpy(block[: n_own * width].reshape(n_own, width)),
-                torch.from_numpy(update[: n_boundary**2].reshape(n_boundary, n_boundary)),
+                _matrix(front, 0, (width, width)),
+                _matrix(blocks, structure.nodes[BLOCK, node], (n_own, width)),
+                _matrix(updates, structure.nodes[UPDATE, node], (n_boundary, n_boundary)),
                 team,
             )
             node += 1
@@ -204,10 +204,14 @@ def analyse(
     """
     matrix, coordinates = checked_graph(matrix, coordinates)
     node, n_levels = nested_dissection(matrix, coordinates, leaf_size)
-    indptr, indices = (
-        array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices)
-    )
-    return Tree(*tree_structure(node, n_levels, indptr, indices))
+    return Tree(*tree_structure(node, n_levels, *pattern(matrix)))
+
+
+def _matrix(array: Floats, start: int, shape: tuple[int, int]) -> torch.Tensor:
+    """Return a view of the matrix that starts at an index of a flat array."""
+    n_rows, n_columns = shape
+    entries = array[start : start + n_rows * n_columns]
+    return torch.from_numpy(entries.reshape(shape))
 
 
 def _eliminate_node(
@@ -216,9 +220,9 @@ def _eliminate_node(
     """Write D, E and the complement, from a front: both upper triangles. Return the number of negative pivots."""
     n_own = len(block)
     n_boundary = len(update)
-    pivot = front[:n_own, :n_own].triu()
+    upper = front[:n_own, :n_own].triu()
     coupling = front[:n_own, n_own:]
-    inverse, n_negative = _invert(pivot + pivot.triu(1).T)
+    inverse, n_negative = _invert(upper + upper.triu(1).T)
     block[:, :n_own] = inverse
     elimination = block[:, n_own:]
     trailing = front[n_own:, n_own:]
@@ -228,12 +232,12 @@ def _eliminate_node(
         elimination[:, piece] = -(inverse @ coupling[:, piece])
 
     def complement(piece: slice) -> None:
-        cols = slice(piece.start, None)
+        columns = slice(piece.start, None)
         torch.addmm(
-            trailing[piece, cols],
+            trailing[piece, columns],
             coupling[:, piece].T,
-            elimination[:, cols],
-            out=update[piece, cols],
+            elimination[:, columns],
+            out=update[piece, columns],
         )
 
     team.each(eliminate, pieces)
@@ -251,9 +255,8 @@ def _invert(pivot: torch.Tensor) -> tuple[torch.Tensor, int]:
         raise SingularMatrixError(
             "shift: expected regular pivot blocks, got a singular one. Change it slightly."
         )
-    inverse = torch.linalg.ldl_solve(
-        factor, order, torch.eye(len(pivot), dtype=pivot.dtype, device="cpu")
-    )
+    inverse = torch.linalg.ldl_solve(factor, order, identity(len(pivot)))
     # Bunch–Kaufman: a 1×1 pivot counts by its sign; a 2×2 pivot, of negative indices, has an eigenvalue of each sign.
-    n_negative = ((order > 0) & (factor.diagonal() < 0)).sum() + (order < 0).sum() // 2
-    return (inverse + inverse.T) / 2, int(n_negative)
+    is_negative = (order > 0) & (factor.diagonal() < 0)
+    n_pairs = int((order < 0).sum()) // 2
+    return (inverse + inverse.T) / 2, int(is_negative.sum()) + n_pairs

@@ -55,33 +55,36 @@ def tree_structure(
 
     The tree is given by the node (V,) of each vertex, numbered as in a heap.
     """
-    n_nodes = 2**n_levels - 1
-    node_at = np.full(n_nodes, n_nodes - 1)  # node at each place of the heap
-    children = np.full((n_nodes, 2), -1)
-    parent = np.full(n_nodes, -1)
-    for level in range(n_levels - 1):
-        parents = np.arange(2**level - 1, 2 ** (level + 1) - 1)
-        right = node_at[parents] - 1
-        left = right - (2 ** (n_levels - level - 1) - 1)  # the whole right subtree lies between
-        node_at[2 * parents + 1] = left
-        node_at[2 * parents + 2] = right
-        children[node_at[parents]] = np.stack([left, right], axis=1)
-        parent[left] = parent[right] = node_at[parents]
+    node_at, children = _full_tree(n_levels)
+    n_nodes = len(node_at)
     node_of = node_at[node]
     order = np.argsort(node_of, kind="stable")
-    position = np.empty_like(order)
-    position[order] = np.arange(len(node))
-    own_start = np.append(0, np.cumsum(np.bincount(node_of, minlength=n_nodes)))
+    position = np.argsort(order)
+    parent = np.full(n_nodes, -1)
+    for side in children.T:
+        has_child = side >= 0
+        parent[side[has_child]] = np.flatnonzero(has_child)
     depth = np.empty(n_nodes, np.int64)
     depth[node_at] = np.log2(np.arange(1, n_nodes + 1))
-    boundary_start, boundary, rows = _boundaries(
-        own_start, parent, depth, position, indptr, indices
-    )
+    own_start = _starts(node_of, n_nodes)
+    pairs = _boundaries(own_start, parent, depth, position, indptr, indices)
+    owner, boundary = np.divmod(pairs, len(node))
+    boundary_start = _starts(owner, n_nodes)
     n_own = np.diff(own_start)
     n_boundary = np.diff(boundary_start)
+
+    # A boundary entry is among the own unknowns of the parent, or behind these on the parent's boundary.
+    parents = parent[owner]
+    place = np.searchsorted(pairs, parents * len(node) + boundary)
+    on_boundary = n_own[parents] + place - boundary_start[parents]
+    is_owned = boundary < own_start[parents + 1]
+    parent_row = np.where(is_owned, boundary - own_start[parents], on_boundary)
+
     subtrees = parallel_subtrees(n_levels, len(node))
-    in_subtrees = {n for begin, end in subtrees for n in range(begin, end)}
-    above = [(n, n + 1) for n in range(n_nodes) if n not in in_subtrees]
+    is_above = np.ones(n_nodes, dtype=bool)
+    for begin, end in subtrees:
+        is_above[begin:end] = False
+    above = [(n, n + 1) for n in np.flatnonzero(is_above).tolist()]
     nodes = np.zeros((7, n_nodes + 1), np.int64)
     nodes[OWN] = own_start
     nodes[BOUNDARY] = boundary_start
@@ -89,8 +92,30 @@ def tree_structure(
     nodes[BLOCK, 1:] = np.cumsum(n_own * (n_own + n_boundary))
     nodes[UPDATE, :-1] = stack_starts(children, n_boundary**2, [*subtrees, *above])
     nodes[CARRIED, :-1] = stack_starts(children, n_boundary, [*subtrees, *above])
-    structure = Structure(indptr, indices, order, position, nodes, boundary, rows)
+    structure = Structure(indptr, indices, order, position, nodes, boundary, parent_row)
     return structure, subtrees, above
+
+
+def _full_tree(n_levels: int) -> tuple[Integers, Integers]:
+    """Return the node at each place of a heap (N,), and the children (N, 2) of each node, -1 for those of leaves."""
+    n_nodes = 2**n_levels - 1
+    node_at = np.full(n_nodes, n_nodes - 1)
+    children = np.full((n_nodes, 2), -1)
+    for level in range(n_levels - 1):
+        places = np.arange(2**level - 1, 2 ** (level + 1) - 1)
+        parents = node_at[places]
+        right = parents - 1
+        left = right - (2 ** (n_levels - level - 1) - 1)  # the whole right subtree lies between
+        node_at[2 * places + 1] = left
+        node_at[2 * places + 2] = right
+        children[parents] = np.stack([left, right], axis=1)
+    return node_at, children
+
+
+def _starts(owner: Integers, n_nodes: int) -> Integers:
+    """Return where the items of each node start, and where the last end: (N + 1,), from the node of each item."""
+    counts = np.bincount(owner, minlength=n_nodes)
+    return np.append(0, np.cumsum(counts))
 
 
 def _boundaries(
@@ -100,43 +125,31 @@ def _boundaries(
     position: Integers,
     indptr: np.ndarray,
     indices: np.ndarray,
-) -> tuple[Integers, Integers, Integers]:
-    """Return the start of each node's boundary, the boundaries, and the row of each entry in the parent's front.
+) -> Integers:
+    """Return the pairs of a node and an unknown on its boundary, sorted, as numbers: node · V + unknown.
 
     The boundary of a node consists of the unknowns that its edges reach and of its children's boundaries, without the
     unknowns that it owns.
     """
-    n_nodes = len(parent)
     n_vertices = len(position)
 
     def after(node: Integers, reached: Integers) -> Integers:
-        """Return the pairs whose unknown comes after those of the node, as numbers that sort by node."""
+        """Return the pairs whose unknown comes after those of the node."""
         is_after = reached >= own_start[node + 1]
         return node[is_after] * n_vertices + reached[is_after]
 
-    owner = np.repeat(np.arange(n_nodes), np.diff(own_start))
-    from_edges = after(owner[position].repeat(np.diff(indptr)), position[indices])
-    level_of_edge = depth[from_edges // n_vertices]
+    owner = np.repeat(np.arange(len(parent)), np.diff(own_start))
+    node_of_edge = np.repeat(owner[position], np.diff(indptr))
+    from_edges = after(node_of_edge, position[indices])
+    depth_of_edge = depth[from_edges // n_vertices]
     inherited = from_edges[:0]
     levels = []
     for level in reversed(range(depth.max() + 1)):
-        levels.append(np.union1d(inherited, from_edges[level_of_edge == level]))
-        node, reached = np.divmod(levels[-1], n_vertices)
+        pairs = np.union1d(inherited, from_edges[depth_of_edge == level])
+        levels.append(pairs)
+        node, reached = np.divmod(pairs, n_vertices)
         inherited = after(parent[node], reached)
-    pairs = np.sort(np.concatenate(levels))
-    node, boundary = np.divmod(pairs, n_vertices)
-    start = np.append(0, np.cumsum(np.bincount(node, minlength=n_nodes)))
-    parents = parent[node]
-    on_boundary = (
-        np.diff(own_start)[parents]
-        + np.searchsorted(pairs, parents * n_vertices + boundary)
-        - start[parents]
-    )
-    return (
-        start,
-        boundary,
-        np.where(boundary < own_start[parents + 1], boundary - own_start[parents], on_boundary),
-    )
+    return np.sort(np.concatenate(levels))
 
 
 def parallel_subtrees(n_levels: int, n_unknowns: int) -> list[Nodes]:
@@ -144,13 +157,16 @@ def parallel_subtrees(n_levels: int, n_unknowns: int) -> list[Nodes]:
 
     They depend only on the matrix and not on the number of threads, and so do rounding errors.
     """
-    depth = min(MAX_SUBTREE_DEPTH, n_levels - 1, max(0, int(n_unknowns / MIN_SUBTREE).bit_length()))
+    n_worthwhile = n_unknowns // MIN_SUBTREE
+    depth = min(MAX_SUBTREE_DEPTH, n_levels - 1, n_worthwhile.bit_length())
+    size = 2 ** (n_levels - depth) - 1
     subtrees = []
     begin = 0
     for number in range(1, 2**depth + 1):
-        subtrees.append((begin, begin + 2 ** (n_levels - depth) - 1))
+        subtrees.append((begin, begin + size))
         # Skips the parents that it completes
-        begin = subtrees[-1][1] + (number & -number).bit_length() - 1
+        n_completed = (number & -number).bit_length() - 1
+        begin += size + n_completed
     return subtrees
 
 
@@ -160,14 +176,15 @@ def stack_starts(children: np.ndarray, sizes: np.ndarray, ranges: list[Nodes]) -
     Each range of nodes has its own stack. A result stays there until its parent is computed: the results of both
     children are then on top, and the parent's result replaces them.
     """
-    starts = np.zeros(len(sizes), dtype=np.int64)
     lengths = sizes.tolist()
     left_child = children[:, 0].tolist()
+    starts = [0] * len(lengths)
     end = 0
     for first, last in ranges:
         top = end
         for n in range(first, last):
-            starts[n] = top if left_child[n] < first else starts[left_child[n]]
-            top = int(starts[n]) + lengths[n]
+            left = left_child[n]
+            starts[n] = top if left < first else starts[left]
+            top = starts[n] + lengths[n]
             end = max(end, top)
-    return starts
+    return np.array(starts, dtype=np.int64)
