@@ -8,7 +8,7 @@ import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers, Surface
 from igps._compiled import ALLOCATES, compiled
-from igps.mesh.surface import longest_side
+from igps.mesh.surface import area_vectors, lengths, longest_side
 
 # Weight of the squared length of an edge in its cost. Without it, flat places get long thin triangles.
 _LENGTH_WEIGHT = 1e-2
@@ -41,28 +41,68 @@ def collapse_edges(vertices: Floats, faces: Integers, n_vertices: int) -> Surfac
     """
     centre = vertices.mean(axis=0)
     scale = longest_side(vertices)
-    faces = np.ascontiguousarray(faces, dtype=np.int64)
-    points, triangles = collapse((vertices - centre) / scale, faces, n_vertices)
-    return points * scale + centre, triangles
+    points = (vertices - centre) / scale
+    rings = _rings(faces, len(points))
+    version = np.zeros(len(points), np.int64)
+    collapse(points, rings, _quadrics(points, faces), version, n_vertices)
+    is_left = version >= 0
+    number = np.cumsum(is_left) - 1
+    triangles = rings.vertex.reshape(-1, 3)[~rings.is_gone]
+    return points[is_left] * scale + centre, number[triangles]
+
+
+def _rings(faces: Integers, n_vertices: int) -> _Rings:
+    """List the corners at each vertex."""
+    vertex = faces.astype(np.int64).ravel()
+    first = np.full(n_vertices, -1)
+    last = np.full(n_vertices, -1)
+    following = np.full(len(vertex), -1)
+    order = np.argsort(vertex, kind="stable")
+    here = order[:-1]
+    there = order[1:]
+    is_same = vertex[here] == vertex[there]
+    following[here[is_same]] = there[is_same]
+    # Of several corners at a vertex, the one that is written last remains.
+    corners = np.arange(len(vertex))
+    last[vertex] = corners
+    first[vertex[::-1]] = corners[::-1]
+    return _Rings(vertex, first, last, following, np.zeros(len(faces), dtype=bool))
+
+
+def _quadrics(points: Floats, faces: Integers) -> Floats:
+    """Return sums over the triangles around each vertex: area times nn' (6), nd (3) and dd, for the plane nx = d."""
+    normals = 2 * area_vectors(points, faces)
+    areas = lengths(normals)
+    has_area = areas > 0
+    faces = faces[has_area]
+    areas = areas[has_area]
+    normals = normals[has_area] / areas[:, None]
+    x, y, z = normals.T
+    d = (normals * points[faces[:, 0]]).sum(axis=1)
+    squares = [x * x, x * y, x * z, y * y, y * z, z * z, x * d, y * d, z * d, d * d]
+    columns = []
+    for square in squares:
+        at_corners = np.repeat(areas * square, 3)
+        columns.append(np.bincount(faces.ravel(), at_corners, len(points)))
+    return np.stack(columns, axis=1)
 
 
 @compiled(**ALLOCATES)
-def collapse(vertices: Floats, faces: Integers, n_vertices: int) -> Surface:
-    """`collapse_edges` of a surface of unit size.
+def collapse(
+    points: Floats, rings: _Rings, quadrics: Floats, version: Integers, n_vertices: int
+) -> None:
+    """Collapse edges until about `n_vertices` vertices are left; all arrays are overwritten.
 
-    The cost of a collapse is the sum of squared distances of the new vertex from the planes of the triangles that it
-    replaces, weighted by their areas. Collapses that change the topology or turn a triangle over are left out.
+    The version (V,) of a vertex, at first 0, grows with each change of it, and is -1 once it is gone. The cost of a
+    collapse is the sum of squared distances of the new vertex from the planes of the triangles that it replaces,
+    weighted by their areas. Collapses that change the topology or turn a triangle over are left out.
     """
-    points = vertices.copy()
-    rings = _rings(faces, len(points))
-    quadrics = _quadrics(points, faces)
-    version = np.zeros(len(points), np.int64)  # changes with the vertex; -1 if it is gone
     mark = np.zeros(len(points), np.int64)
-    at_a = np.empty(len(faces), np.int64)
-    at_b = np.empty(len(faces), np.int64)
+    at_a = np.empty(len(rings.is_gone), np.int64)
+    at_b = np.empty(len(rings.is_gone), np.int64)
     place = np.empty(3)
     queue = [(0.0, 0, 0, 0, 0) for _ in range(0)]
-    for corner in range(3 * len(faces)):
+    for corner in range(len(rings.vertex)):
         a = rings.vertex[corner]
         b = rings.vertex[_next(corner)]
         if a < b:
@@ -94,36 +134,12 @@ def collapse(vertices: Floats, faces: Integers, n_vertices: int) -> Surface:
             b = rings.vertex[_next(corner)]
             cost = _best_place(quadrics[a], quadrics[b], points[a], points[b], place)
             heapq.heappush(queue, (cost, a, b, version[a], version[b]))
-    number = np.cumsum(version >= 0) - 1
-    kept = np.flatnonzero(~rings.is_gone)
-    triangles = np.empty((len(kept), 3), np.int64)
-    for row in range(len(kept)):
-        for side in range(3):
-            triangles[row, side] = number[rings.vertex[3 * kept[row] + side]]
-    return points[version >= 0], triangles
 
 
 @compiled()
 def _next(corner: int) -> int:
     """Return the next corner of the same triangle."""
     return corner - 2 if corner % 3 == 2 else corner + 1
-
-
-@compiled(**ALLOCATES)
-def _rings(faces: Integers, n_vertices: int) -> _Rings:
-    """List the corners at each vertex."""
-    vertex = faces.copy().reshape(-1)
-    first = np.full(n_vertices, -1)
-    last = np.full(n_vertices, -1)
-    following = np.full(len(vertex), -1)
-    for corner in range(len(vertex)):
-        at = vertex[corner]
-        if first[at] < 0:
-            first[at] = corner
-        else:
-            following[last[at]] = corner
-        last[at] = corner
-    return _Rings(vertex, first, last, following, np.zeros(len(faces), np.bool_))
 
 
 @compiled()
@@ -169,27 +185,6 @@ def _merge(rings: _Rings, a: int, b: int, at_b: Integers) -> None:
         rings.vertex[corner] = a
     rings.following[rings.last[a]] = rings.first[b]
     rings.last[a] = rings.last[b]
-
-
-@compiled(**ALLOCATES)
-def _quadrics(points: Floats, faces: Integers) -> Floats:
-    """Return sums over the triangles around each vertex: area times nn' (6), nd (3) and dd, for the plane nx = d."""
-    quadrics = np.zeros((len(points), 10))
-    for face in range(len(faces)):
-        a = points[faces[face, 0]]
-        nx, ny, nz = _normal(a, points[faces[face, 1]], points[faces[face, 2]])
-        area = math.sqrt(nx * nx + ny * ny + nz * nz)
-        if area == 0:
-            continue
-        x = nx / area
-        y = ny / area
-        z = nz / area
-        d = x * a[0] + y * a[1] + z * a[2]
-        row = (x * x, x * y, x * z, y * y, y * z, z * z, x * d, y * d, z * d, d * d)
-        for side in range(3):
-            for at in range(10):
-                quadrics[faces[face, side], at] += area * row[at]
-    return quadrics
 
 
 @compiled()

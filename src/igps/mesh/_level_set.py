@@ -93,8 +93,10 @@ def distances(
         near = np.sqrt(squared) <= to_centre * np.sqrt(3) + _BAND
         size //= 2
         halves = size * _all_combinations([np.arange(2)] * 3)
-        blocks = (blocks[near][:, None] + halves).reshape(-1, 3)
-        blocks = blocks[(blocks < shape).all(axis=1)]
+        blocks = blocks[near][:, None] + halves
+        blocks = blocks.reshape(-1, 3)
+        is_in_grid = (blocks < shape).all(axis=1)
+        blocks = blocks[is_in_grid]
     squared, feet = nearest_to(blocks)
     distance = np.full(shape, np.inf, dtype=np.float32)
     nearest = np.zeros((*shape, 3), dtype=np.float32)
@@ -188,7 +190,8 @@ def fill_bubbles(field: Singles) -> Singles:
     """Make everything part of the body, in place, that is not connected with the outside."""
     label, count = ndimage.label(field > 0)
     if count > 1:
-        field[(field > 0) & (label != label[0, 0, 0])] = -MIN_ABS_VALUE
+        is_bubble = (field > 0) & (label != label[0, 0, 0])
+        field[is_bubble] = -MIN_ABS_VALUE
     return field
 
 
@@ -199,8 +202,9 @@ def join_pieces(field: Singles, notes: list[str], radius: float = 0.0) -> Single
         return field
     volume = np.bincount(label.ravel(), minlength=count + 1)
     volume[0] = 0
-    specks = np.flatnonzero(volume < SPECK_VOLUME * volume.sum())[1:]
-    if len(specks) and volume[specks].sum() < 0.05 * volume.sum():
+    total = volume.sum()
+    specks = np.flatnonzero(volume < SPECK_VOLUME * total)[1:]
+    if len(specks) and volume[specks].sum() < 0.05 * total:
         is_dropped = np.isin(label, specks)
         field[is_dropped] = -field[is_dropped]
         label[is_dropped] = 0

@@ -197,7 +197,8 @@ def _cavities_among(
     """Return those of the hidden parts that are closed and lie in no other, the largest first."""
     hollows: list[Mesh] = []
     found = []
-    for k in sorted(hidden.tolist(), key=lambda k: -areas[k]):
+    order = np.argsort(-areas[hidden], kind="stable")
+    for k in hidden[order].tolist():
         try:
             hollow = Mesh(*compact(vertices, faces[part == k]))
         except MeshError:
@@ -220,7 +221,8 @@ def fill_small_holes(vertices: Floats, faces: Integers, notes: list[str]) -> Sur
     n_filled = 0
     for loop in _boundary_loops(faces):
         rim = vertices[loop]
-        length = lengths(rim - np.roll(rim, -1, axis=0)).sum()
+        sides = rim - np.roll(rim, -1, axis=0)
+        length = lengths(sides).sum()
         area_of_circle = length**2 / (4 * np.pi)
         area_of_part = areas[part_of_vertex[loop[0]]]
         if area_of_circle <= _SMALL_HOLE * area_of_part:
@@ -254,7 +256,8 @@ def _boundary_loops(faces: Integers) -> list[Integers]:
     starts = start[free].tolist()
     forward = defaultdict(list)
     backward = defaultdict(list)
-    for edge, (a, b) in enumerate(zip(starts, end[free].tolist(), strict=True)):
+    ends = end[free].tolist()
+    for edge, (a, b) in enumerate(zip(starts, ends, strict=True)):
         forward[a].append((edge, b))
         backward[b].append((edge, a))
     visited: set[int] = set()
@@ -310,7 +313,8 @@ def _span(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
     plane = np.concatenate(disc)
     patch = Delaunay(plane).simplices.astype(np.int64)  # counter-clockwise, like the loop
     film = _solve_umbrella(rim, patch, len(plane), order=1)
-    index = np.append(loop, len(vertices) + np.arange(len(film)))
+    new = len(vertices) + np.arange(len(film))
+    index = np.append(loop, new)
     return np.vstack([vertices, film]), np.vstack([faces, index[patch]])
 
 
@@ -322,9 +326,9 @@ def _circle(turns: Floats, radius: float) -> Floats:
 def _solve_umbrella(fixed: Floats, faces: Integers, n_points: int, order: int) -> Floats:
     """Return the points after the fixed ones, placed so that the umbrella operator to the power `order` is 0."""
     edges, _ = undirected_edges(faces)
-    ends = np.concatenate([edges, edges[:, ::-1]]).T
-    shape = (n_points, n_points)
-    graph = sparse.coo_array((np.ones(2 * len(edges)), tuple(ends)), shape=shape).tocsr()
+    start, end = np.concatenate([edges, edges[:, ::-1]]).T
+    ones = np.ones(len(start))
+    graph = sparse.csr_array((ones, (start, end)), shape=(n_points, n_points))
     averaging = sparse.diags_array(1 / graph.sum(axis=1)) @ graph
     umbrella = sparse.eye_array(n_points) - averaging
     if order == 2:

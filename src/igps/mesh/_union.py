@@ -20,7 +20,7 @@ def unite_parts(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     import manifold3d
 
     part, areas = face_parts(vertices, faces)
-    large = np.nonzero(areas >= SPECK * areas.sum())[0]
+    large = np.flatnonzero(areas >= SPECK * areas.sum())
     if not 1 < len(large) <= _MAX_PARTS:
         return vertices, faces
     solids = []
@@ -32,7 +32,8 @@ def unite_parts(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
             body = Mesh(points, triangles)
         except MeshError:
             return vertices, faces
-        surface = manifold3d.Mesh64(body.vertices.copy(), body.faces.astype(np.uint64))
+        corners = body.faces.astype(np.uint64)
+        surface = manifold3d.Mesh64(body.vertices.copy(), corners)
         solid = manifold3d.Manifold(surface)
         if solid.status() != manifold3d.Error.NoError:
             return vertices, faces
@@ -40,7 +41,8 @@ def unite_parts(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     union = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
     if union.status() != manifold3d.Error.NoError or len(union.decompose()) != 1:
         return vertices, faces
-    mesh = union.to_mesh64()
     notes.append(f"united {len(solids)} closed parts that overlap")
-    united = np.asarray(mesh.vert_properties)[:, :3].copy()
-    return united, np.asarray(mesh.tri_verts, dtype=np.int64)
+    mesh = union.to_mesh64()
+    vertices = np.asarray(mesh.vert_properties)[:, :3].copy()
+    faces = np.asarray(mesh.tri_verts, dtype=np.int64)
+    return vertices, faces

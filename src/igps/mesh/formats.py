@@ -88,11 +88,15 @@ def format_of(path: str | Path) -> Format | None:
     name = Path(path).name.lower()
     if any(name.endswith(kind.ignored) for kind in all_formats()):
         return None
-    matches = {
-        suffix: kind for kind in all_formats() for suffix in kind.suffixes if name.endswith(suffix)
-    }
-    if matches:
-        return matches[max(matches, key=len)]
+    longest = ""
+    best = None
+    for kind in all_formats():
+        for suffix in kind.suffixes:
+            if name.endswith(suffix) and len(suffix) >= len(longest):
+                longest = suffix
+                best = kind
+    if best is not None:
+        return best
     for kind in all_formats():
         if kind.recognises is not None and kind.recognises(Path(path)):
             return kind
@@ -118,7 +122,9 @@ def has_numbers(path: Path) -> bool:
 def names_of(path: Path, options: LoadOptions) -> list[Path]:
     """Return the table that names the bodies of a file; none if there is no table, or the format has no numbers."""
     kind = format_of(path)
-    table = None if kind is None or kind.names is None else kind.names(path, options.names)
+    if kind is None or kind.names is None:
+        return []
+    table = kind.names(path, options.names)
     return [] if table is None else [table]
 
 
@@ -130,7 +136,11 @@ def is_searched(path: str | Path) -> bool:
 
 def searched_suffixes() -> list[str]:
     """Return the suffixes of files that are taken for bodies when a folder is searched, sorted."""
-    return sorted(suffix for kind in all_formats() if kind.is_searched for suffix in kind.suffixes)
+    suffixes: list[str] = []
+    for kind in all_formats():
+        if kind.is_searched:
+            suffixes += kind.suffixes
+    return sorted(suffixes)
 
 
 def stat_key(*paths: Path) -> tuple[int, int, int]:
@@ -155,7 +165,8 @@ def faults(path: object, kind: Format) -> Iterator[None]:
         install = f'Install it: pip install "interior-gps[{kind.extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
         raise MeshError(f"{missing} {install}") from error
     except Exception as error:  # the loaders of some thirty formats raise whatever they like
-        words = _ITK_PREFIX.sub("", " ".join(str(error).split()))[:300]
+        words = " ".join(str(error).split())
+        words = _ITK_PREFIX.sub("", words)[:300]
         fault = f"{path}: not readable as {kind.name} ({type(error).__name__}: {words})."
         remedy = "Check that the file is complete and that its suffix names its format, or export it again."
         raise MeshError(f"{fault} {remedy}") from error

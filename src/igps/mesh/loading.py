@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -145,7 +146,8 @@ def each_raw_body(
 ) -> Iterator[tuple[BodyRef, RawBody]]:
     """Iterate over the bodies of a file as they were read, slow surfaces not yet computed; see `RawBody.made`."""
     path = Path(path)
-    for raw in _read(path, options, parts[0] if parts and len(parts) == 1 else None):
+    only = parts[0] if parts and len(parts) == 1 else None
+    for raw in _read(path, options, only):
         if parts is None or raw.part in parts:
             yield BodyRef(path, raw.part), raw
 
@@ -156,12 +158,15 @@ def read_surface(
     """Return the unchecked surface of a body as it is in the file; for `part` and the errors see `load_mesh`."""
     path = Path(path)
     bodies = _read(path, options, part)
-    matching = [body for body in bodies if body.part == part] if part is not None else bodies
+    matching = bodies if part is None else [body for body in bodies if body.part == part]
     if len(matching) == 1:
         with faults(path, _format(path)):
             return matching[0].made()
-    names = [body.part for body in (bodies if part is None else list_bodies(path, options))]
-    shown = ", ".join(repr(name) for name in names[:8]) + (", ..." if len(names) > 8 else "")
+    known: Sequence[RawBody | BodyRef] = bodies if part is None else list_bodies(path, options)
+    names = [body.part for body in known]
+    shown = ", ".join(map(repr, names[:8]))
+    if len(names) > 8:
+        shown += ", ..."
     if part is None:
         raise MeshError(
             f"{path}: holds {len(names)} bodies: {shown}. Name one as part=, or read all by load_bodies."
@@ -203,7 +208,8 @@ def surface_body(
         name=name,
     )
     # Of another surface, such as one of the pieces, the area is not known
-    is_same = math.isclose(mesh.area, face_areas(raw.vertices, raw.faces).sum(), rel_tol=1e-6)
+    area = face_areas(raw.vertices, raw.faces).sum()
+    is_same = math.isclose(mesh.area, area, rel_tol=1e-6)
     fine_area = raw.fine_area if is_same else None
     return mesh.annotated(
         notes=notes, unit=raw.unit, frame=raw.frame, fine_area=fine_area, given=raw.given
@@ -212,28 +218,29 @@ def surface_body(
 
 def _with_coordinates(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, list[str]]:
     """Drop a few vertices that are not finite, with their faces; or return all if they are more than a sliver."""
-    is_lost: Booleans = np.asarray(~np.isfinite(vertices).all(axis=1))
-    is_valid = len(faces) == 0 or (faces.min() >= 0 and faces.max() < len(vertices))
-    if not is_lost.any() or not is_valid:
+    is_found: Booleans = np.asarray(np.isfinite(vertices).all(axis=1))
+    is_valid = faces.min(initial=0) >= 0 and faces.max(initial=-1) < len(vertices)
+    if is_found.all() or not is_valid:
         return vertices, faces, []
-    has_lost = is_lost[faces].any(axis=1)
-    share = has_lost.mean() if len(faces) else is_lost.mean()
-    if share > _MAX_LOST:
+    is_whole = is_found[faces].all(axis=1)
+    kept = is_whole if len(faces) else is_found
+    if (~kept).mean() > _MAX_LOST:
         return vertices, faces, []
-    n_lost = counted(int(is_lost.sum()), "vertex")
-    note = f"dropped {n_lost} without coordinates and {counted(int(has_lost.sum()), 'face')}"
+    n_lost = counted(int((~is_found).sum()), "vertex")
+    n_faces = counted(int((~is_whole).sum()), "face")
+    note = f"dropped {n_lost} without coordinates and {n_faces}"
     if not len(faces):
-        return vertices[~is_lost], faces, [note]
-    return *compact(vertices, faces[~has_lost]), [note]
+        return vertices[is_found], faces, [note]
+    return *compact(vertices, faces[is_whole]), [note]
 
 
 def _rounding_notes(vertices: Floats, name: str) -> list[str]:
     """Return a note if coordinates in single precision are so far from the origin that rounding changes the shape."""
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # values that are not finite are rejected later
+    # Values that are not finite are rejected later
+    with np.errstate(over="ignore", invalid="ignore"):
         single = vertices.astype(np.float32)
-        step = float(np.spacing(np.abs(single).max(initial=0)))
+        largest = np.abs(single).max(initial=0)
+        step = float(np.spacing(largest))
         size = diagonal(vertices) if len(vertices) else 0.0
     if not _COARSE * size < step < size or (single != vertices).any():
         return []
@@ -248,30 +255,26 @@ def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[Raw
     kind = _body_kind(file_format, options)
     if file_format.bodies[0] == "whole" and file_format.has_triangles:
         check_memory(path)
-    part = None if kind in ("whole", "pieces") else part
+    if kind in ("whole", "pieces"):
+        part = None
     with faults(path, file_format):
         bodies = list(file_format.read(path, replace(options, bodies=kind), part))
         if kind == "whole":
             return [joined(bodies)]
-        return (
-            pieces(joined(bodies))
-            if kind == "pieces" and kind not in file_format.bodies
-            else bodies
-        )
+        if kind == "pieces" and kind not in file_format.bodies:
+            return pieces(joined(bodies))
+        return bodies
 
 
 def _body_kind(file_format: Format, options: LoadOptions) -> BodyKind:
-    return (
-        options.bodies
-        if options.bodies in (*file_format.bodies, "whole", "pieces")
-        else file_format.bodies[0]
-    )
+    if options.bodies in (*file_format.bodies, "whole", "pieces"):
+        return options.bodies
+    return file_format.bodies[0]
 
 
 def _format(path: Path) -> Format:
-    if not os.path.isfile(
-        path
-    ):  # unlike Path.is_file, it raises nothing for names that no file can have
+    # Unlike Path.is_file, this raises nothing for names that no file can have
+    if not os.path.isfile(path):
         if os.path.isdir(path):
             raise MeshError(f"{path}: expected a file, got a folder. Name each file in it.")
         raise MeshError(f"{path}: no such file. Check the path.")
@@ -279,6 +282,7 @@ def _format(path: Path) -> Format:
         raise MeshError(f"{path}: the file is empty (0 bytes). Export it again.")
     file_format = format_of(path)
     if file_format is None:
-        suffixes = ", ".join(suffix for known in all_formats() for suffix in known.suffixes)
-        raise MeshError(f"{path}: unknown file format. Convert the file to one of {suffixes}.")
+        suffixes = chain.from_iterable(known.suffixes for known in all_formats())
+        remedy = f"Convert the file to one of {', '.join(suffixes)}."
+        raise MeshError(f"{path}: unknown file format. {remedy}")
     return file_format

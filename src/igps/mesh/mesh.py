@@ -169,7 +169,8 @@ class Mesh:
         """Return the mesh with its vertices in the order in which the faces first use them."""
         used, first = np.unique(self.faces, return_index=True)
         order = used[np.argsort(first)]
-        return self._changed(vertices=self.vertices[order], faces=np.argsort(order)[self.faces])
+        rank = np.argsort(order)
+        return self._changed(vertices=self.vertices[order], faces=rank[self.faces])
 
     def _changed(self, **fields: object) -> Self:
         other = copy.copy(self)

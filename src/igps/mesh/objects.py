@@ -41,7 +41,8 @@ def as_mesh(body: Any, spacing: Sequence[float] | None = None) -> Mesh:
         name, raw = surface
     else:
         name = "volume"
-        raw = _single(object_bodies(body if spacing is None else (body, spacing), name)).made()
+        thing = body if spacing is None else (body, spacing)
+        raw = _single(object_bodies(thing, name)).made()
     if raw.fault is not None:
         raise raw.fault
     mesh = Mesh(raw.vertices, raw.faces, name=name, unit=raw.unit, notes=raw.notes)
@@ -74,16 +75,10 @@ def _single(bodies: Sequence[RawBody]) -> RawBody:
 
 def _surface(thing: Any) -> tuple[str, RawBody] | None:
     """Return the name and the unchecked surface of an object that has vertices and faces; None if it has none."""
-    metadata = getattr(thing, "metadata", None)
-    source = getattr(thing, "source", None)
-    file_name = metadata.get("file_name") if isinstance(metadata, dict) else None
-    path = getattr(source, "file_path", None)  # trimesh keeps the path of the file here
-    name = str(file_name or (Path(path).name if path else "mesh"))
+    name = _file_name(thing)
     if hasattr(thing, "get_arrays_from_intent"):
-        points, faces = (
-            thing.get_arrays_from_intent(f"NIFTI_INTENT_{kind}")
-            for kind in ("POINTSET", "TRIANGLE")
-        )
+        points = thing.get_arrays_from_intent("NIFTI_INTENT_POINTSET")
+        faces = thing.get_arrays_from_intent("NIFTI_INTENT_TRIANGLE")
         if not points or not faces:
             raise TypeError(
                 "mesh: expected a GIFTI image of a surface, got one without points or triangles."
@@ -93,11 +88,22 @@ def _surface(thing: Any) -> tuple[str, RawBody] | None:
         return name, RawBody(vertices, triangles, unit="mm", frame="RAS")
     if hasattr(thing, "points") and hasattr(thing, "faces"):
         vertices = np.asarray(thing.points, np.float64)
-        corners, n_corners = corners_of_rows(np.asarray(thing.faces, dtype=np.int64))
-        return name, RawBody(vertices, flat_triangles(corners, n_corners, vertices))
+        rows = np.asarray(thing.faces, dtype=np.int64)
+        triangles = flat_triangles(*corners_of_rows(rows), vertices)
+        return name, RawBody(vertices, triangles)
     if hasattr(thing, "vertices") and hasattr(thing, "faces"):
-        unit = getattr(thing, "units", None) or getattr(thing, "unit", None)
         vertices = np.asarray(thing.vertices, np.float64)
         triangles = np.asarray(thing.faces, np.int64)
-        return name, RawBody(vertices, triangles, unit=unit, notes=getattr(thing, "notes", ()))
+        unit = getattr(thing, "units", None) or getattr(thing, "unit", None)
+        notes = getattr(thing, "notes", ())
+        return name, RawBody(vertices, triangles, unit=unit, notes=notes)
     return None
+
+
+def _file_name(thing: Any) -> str:
+    metadata = getattr(thing, "metadata", None)
+    if isinstance(metadata, dict) and metadata.get("file_name"):
+        return str(metadata["file_name"])
+    source = getattr(thing, "source", None)
+    path = getattr(source, "file_path", None)  # trimesh keeps the path of the file here
+    return Path(path).name if path else "mesh"

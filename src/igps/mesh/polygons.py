@@ -19,13 +19,16 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
         return corners[first[:, None] + np.arange(n)]
 
     quads = of_size(4)
+    first_halves = quads[:, [0, 1, 2]]
+    second_halves = quads[:, [2, 3, 0]]
     is_large = n_corners > 4
     n_triangles = n_corners[is_large] - 2
     n_before = np.cumsum(n_triangles) - n_triangles
     first = np.repeat(starts[is_large], n_triangles)
-    second = first + 1 + np.arange(len(first)) - np.repeat(n_before, n_triangles)
-    fans = corners[np.stack([first, second, second + 1], axis=1)]
-    return np.concatenate([of_size(3), quads[:, [0, 1, 2]], quads[:, [2, 3, 0]], fans])
+    number = np.arange(len(first)) - np.repeat(n_before, n_triangles)
+    second = first + 1 + number
+    fans = np.stack([first, second, second + 1], axis=1)
+    return np.concatenate([of_size(3), first_halves, second_halves, corners[fans]])
 
 
 def strip_triangles(corners: Integers) -> Integers:

@@ -100,22 +100,25 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
     meshes = [body for body in bodies if len(body.faces)]
     joinable = meshes or [body for body in bodies if len(body.vertices)]
     if not joinable:
-        return RawBody(fault=next((body.fault for body in bodies if body.fault), None))
+        faults = [body.fault for body in bodies if body.fault]
+        return RawBody(fault=faults[0] if faults else None)
     for body in meshes:
-        if body.faces.min() < 0 or body.faces.max() >= len(
-            body.vertices
-        ):  # would refer to another body
+        # Other numbers would refer to another body
+        if body.faces.min() < 0 or body.faces.max() >= len(body.vertices):
             raise ValueError(f"{body.part} refers to vertices that are not there")
     units = {body.unit for body in joinable}
     frames = {body.frame for body in joinable}
     normals = [body.normals for body in joinable if body.normals is not None]
+    notes = [note for body in joinable for note in body.notes]
+    vertices, faces = stacked([(body.vertices, body.faces) for body in joinable])
     return RawBody(
-        *stacked([(body.vertices, body.faces) for body in joinable]),
+        vertices,
+        faces,
         unit=units.pop() if len(units) == 1 else None,
         frame=frames.pop() if len(frames) == 1 else None,
         unit_from=joinable[0].unit_from,
         normals=np.concatenate(normals) if len(normals) == len(joinable) else None,
-        notes=tuple(dict.fromkeys(note for body in joinable for note in body.notes)),
+        notes=tuple(dict.fromkeys(notes)),
         denoise=any(body.denoise for body in joinable),
     )
 
@@ -130,19 +133,20 @@ def pieces(whole: RawBody) -> list[RawBody]:
     # Unused vertices would widen the bounding box, which scales `places`
     vertices, faces = compact(vertices, faces)
     # Triangles need not share vertices: they are connected by position
-    owner, areas = face_parts(vertices, places(vertices)[faces])
-    small = are_specks(areas)
-    notes = (
-        (*whole.notes, f"left out {counted(int(small.sum()), 'speck')}")
-        if small.any()
-        else whole.notes
-    )
-    order = [k for k in np.argsort(np.unique(owner, return_index=True)[1]) if not small[k]]
-    surfaces = [compact(vertices, faces[owner == k]) for k in order]
-    return [
-        replace(whole, vertices=v, faces=f, part=f"piece {i}", notes=notes)
-        for i, (v, f) in enumerate(surfaces, 1)
-    ]
+    part, areas = face_parts(vertices, places(vertices)[faces])
+    is_speck = are_specks(areas)
+    notes = whole.notes
+    if is_speck.any():
+        notes = (*notes, f"left out {counted(int(is_speck.sum()), 'speck')}")
+    _, first_face = np.unique(part, return_index=True)
+    order = np.argsort(first_face)
+    bodies = []
+    for number, k in enumerate(order[~is_speck[order]], start=1):
+        points, triangles = compact(vertices, faces[part == k])
+        name = f"piece {number}"
+        body = replace(whole, vertices=points, faces=triangles, part=name, notes=notes)
+        bodies.append(body)
+    return bodies
 
 
 def distinct(names: Iterable[str]) -> list[str]:

@@ -71,7 +71,8 @@ def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
         cut = longest[length[longest] > 0.7 * length.max()]
         middle = np.full(len(edges), -1)
         middle[cut] = len(vertices) + np.arange(len(cut))
-        vertices = np.vstack([vertices, vertices[edges[cut]].mean(axis=1)])
+        middles = vertices[edges[cut]].mean(axis=1)
+        vertices = np.vstack([vertices, middles])
         faces = _cut(vertices, faces, middle[edge_of_side].reshape(-1, 3))
     note = f"subdivided from {n_before} to {len(vertices)} vertices"
     return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))
@@ -98,8 +99,9 @@ def _cut(vertices: Floats, faces: Integers, middle: Integers) -> Integers:
             from_a = lengths(vertices[a] - vertices[q])
             from_p = lengths(vertices[p] - vertices[c])
             by_a = from_a < from_p
+            second = (a, np.where(by_a, q, p), c)
             third = (np.where(by_a, a, p), np.where(by_a, p, q), np.where(by_a, q, c))
-            corners = [(p, b, q), (a, np.where(by_a, q, p), c), third]
+            corners = [(p, b, q), second, third]
         else:
             corners = [(a, p, r), (p, b, q), (r, q, c), (p, q, r)]
         pieces.extend(np.stack(corner, axis=1) for corner in corners)

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from igps._arrays import Floats, Integers
+from igps._arrays import Floats, Integers, Surface
 from igps._parameters import check_at_least
 from igps._text import counted
 from igps.mesh._level_set import (
@@ -82,7 +82,8 @@ def watertight(
         raise MeshError(
             f"{name}: expected a surface, but no triangle has an area. Give lines some thickness."
         )
-    part, areas = face_parts(vertices, places(vertices)[faces])
+    welded = places(vertices)[faces]
+    part, areas = face_parts(vertices, welded)
     is_speck = are_specks(areas)
     if is_speck.any():
         notes.append(f"dropped {counted(int(is_speck.sum()), 'speck')}")
@@ -105,7 +106,8 @@ def watertight(
     outside, n_closed = find_outside(distance, surface)
     if n_closed:
         notes.append(f"closed {counted(n_closed, 'opening')}")
-    field = join_pieces(level_set(distance, nearest, outside, surface), notes)
+    field = level_set(distance, nearest, outside, surface)
+    field = join_pieces(field, notes)
     vertices, faces = largest(*level_surface(field, name))
     sides = " x ".join(str(n) for n in grid.shape)
     notes.append(f"made watertight on a grid of {sides} cells")
@@ -118,8 +120,10 @@ def crosses_itself(vertices: Floats, faces: Integers) -> bool:
     """Return whether any two faces intersect outside their common vertices and edges, by exact predicates."""
     from igl.predicates import find_self_intersections
 
-    surface = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
-    return bool(find_self_intersections(*surface, first_only=True)[0])
+    vertices = np.ascontiguousarray(vertices)
+    faces = np.ascontiguousarray(faces)
+    crossings, *_ = find_self_intersections(vertices, faces, first_only=True)
+    return bool(crossings)
 
 
 def splats(
@@ -142,8 +146,8 @@ def splats(
     if len(points) > _MAX_POINTS:
         # Keep one point in each quarter of a cell.
         quarter = side / (4 * resolution)
-        lattice = np.floor((points - points.min(axis=0)) / quarter)
-        _, first = np.unique(lattice.astype(np.int64), axis=0, return_index=True)
+        lattice = np.floor((points - points.min(axis=0)) / quarter).astype(np.int64)
+        _, first = np.unique(lattice, axis=0, return_index=True)
         points = points[first]
         normals = None if normals is None else normals[first]
     distance, neighbours = cKDTree(points).query(points, k=min(13, len(points)))
@@ -152,7 +156,8 @@ def splats(
     spacing = float(np.median(reach))
     radius = np.clip(reach, spacing / 2, 2 * spacing)
     if normals is None:
-        local = points[neighbours] - points[neighbours].mean(axis=1, keepdims=True)
+        around = points[neighbours]
+        local = around - around.mean(axis=1, keepdims=True)
         _, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", local, local))
         normals = axes[:, :, 0]
     normals = np.asarray(normals, dtype=np.float64)
@@ -160,13 +165,22 @@ def splats(
         raise MeshError(
             f"{name}: normals: expected finite numbers of shape {points.shape}. Leave out the normals."
         )
+    vertices, faces = _discs(points, normals, radius)
+    return vertices, faces, spacing / 2
+
+
+def _discs(points: Floats, normals: Floats, radius: Floats) -> Surface:
+    """Return hexagonal discs of these radii (P,) around points (P, 3), across the normals (P, 3)."""
     # Two directions in the plane, computed from the axis that is least parallel to the normal.
-    axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    smallest = np.argmin(np.abs(normals), axis=1)
+    axis = np.eye(3)[smallest]
     u = unit(np.cross(normals, axis))
     v = unit(np.cross(normals, u))
     angle = np.arange(6)[:, None] * np.pi / 3
-    circle = np.cos(angle) * u[:, None] + np.sin(angle) * v[:, None]
+    circle = np.cos(angle) * u[:, None]
+    circle += np.sin(angle) * v[:, None]
     rim = points[:, None] + radius[:, None, None] * circle
     fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
-    faces = (6 * np.arange(len(points))[:, None, None] + fan).reshape(-1, 3)
-    return rim.reshape(-1, 3), faces, spacing / 2
+    first = 6 * np.arange(len(points))
+    faces = first[:, None, None] + fan
+    return rim.reshape(-1, 3), faces.reshape(-1, 3)

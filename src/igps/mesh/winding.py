@@ -1,15 +1,13 @@
 """Winding numbers of a triangle mesh."""
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from igps._arrays import Floats, Integers
 from igps.mesh.surface import has_area
 
 
-def winding_number(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
-) -> Floats:
+def winding_number(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> Floats:
     """Return the winding numbers (P,) of a mesh about points (P, 3): the solid angle of its faces over 4π.
 
     They are 1 inside and 0 outside a closed, outward oriented surface, and fractions for an open one; on the surface
@@ -29,7 +27,7 @@ def winding_number(
 
 
 def check_mesh_and_points(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
+    vertices: ArrayLike, faces: ArrayLike, points: ArrayLike
 ) -> tuple[Floats, Integers, Floats]:
     """Return the vertices and faces of a mesh, and points, as float64 and int64; a ValueError for invalid arrays."""
     v = np.asarray(vertices, np.float64)

@@ -87,8 +87,10 @@ class Placed:
         low, high = self.solid.box()
         local_centre = 0.5 * (low + high)
         local_half = 0.5 * (high - low)
-        centre = (self.rotation * local_centre).sum(axis=1) + self.offset
-        half = (np.abs(self.rotation) * local_half).sum(axis=1)
+        turned_centre = self.rotation * local_centre
+        turned_half = np.abs(self.rotation) * local_half
+        centre = turned_centre.sum(axis=1) + self.offset
+        half = turned_half.sum(axis=1)
         return centre - half, centre + half
 
 
@@ -160,7 +162,8 @@ def pose(
             thickness, length = np.exp(rng.uniform(-1.0, 1.0, 2) * _PROPORTIONS)
             proportions[part.group] = (float(thickness), float(length))
         own = proportions[part.group]
-        angles = flex * np.array(part.bend) * rng.uniform(-1.0, 1.0, 3)
+        limits = flex * np.array(part.bend)
+        angles = limits * rng.uniform(-1.0, 1.0, 3)
         frame = frame @ part.turn @ turned("xyz", *angles)
         solid = part.solid.stretched(*own)
         factors = part.solid.factors(*own)

@@ -97,7 +97,8 @@ class HatSurface:
         self.table = _face_table(corners)
         n_corners = self.faces.size
         columns = (np.ones(n_corners), self.faces.ravel(), np.arange(n_corners + 1))
-        incidence = sparse.csc_matrix(columns, shape=(len(vertices), n_corners)).tocsr()
+        shape = (len(vertices), n_corners)
+        incidence = sparse.csc_matrix(columns, shape=shape).tocsr()
         self.hats = _hats(vertices, incidence, corners, self.table)
         self.face_starts = incidence.indptr.astype(np.int64)
         self.incident_faces = incidence.indices.astype(np.int64) // 3
@@ -114,12 +115,14 @@ class HatSurface:
         fill_hats(x, hats, self.hats, ratio, last_rows, near)
         row_of = np.full(len(self.order), len(hats))
         row_of[hats] = np.arange(len(hats))
-        near_hats = np.where(near[:-1].any(axis=1), hats, -1)
+        is_near = near[:-1].any(axis=1)
+        near_hats = np.where(is_near, hats, -1)
         surface = (self.faces, self.table, self.face_starts, self.incident_faces)
         touched = Touched(np.full(n, -1), np.empty((n, 3)))
         add_near_faces(x, near_hats, near, surface, row_of, last_rows, touched, pairs_for(n))
         on_surface = np.flatnonzero(touched.face_at >= 0)
-        corners = self.faces[touched.face_at[on_surface]]
+        touched_faces = touched.face_at[on_surface]
+        corners = self.faces[touched_faces]
         out[:, on_surface] = 0
         last_rows[row_of[corners], on_surface[:, None]] = touched.barycentric[on_surface]
 
@@ -162,8 +165,8 @@ def _hats(vertices: Floats, incidence: sparse.csr_matrix, corners: Floats, table
     mass = integral(np.ones_like(third_areas))
     flux = integral(normals)
     normal_moments = integral(_outer(normals, total)) / 4
-    moments = integral(_outer(total, total) + corners.transpose(0, 2, 1) @ corners)
-    moments = moments / mass[..., None]
+    squares = _outer(total, total) + corners.transpose(0, 2, 1) @ corners
+    moments = integral(squares) / mass[..., None]
     total = integral(total) / mass
     centres = (vertices + total) / 4
     to_vertex = vertices - centres
@@ -178,7 +181,8 @@ def _hats(vertices: Floats, incidence: sparse.csr_matrix, corners: Floats, table
     one_side = np.roll(squared_sides, -1, axis=1)
     other_side = np.roll(squared_sides, -2, axis=1)
     longest = np.sqrt(np.maximum(one_side, other_side)).ravel()
-    extents = np.maximum.reduceat(longest[incidence.indices], incidence.indptr[:-1])
+    by_vertex = longest[incidence.indices]
+    extents = np.maximum.reduceat(by_vertex, incidence.indptr[:-1])
     radii = extents + lengths(to_vertex)
     constant = (flux * to_vertex).sum(axis=1, keepdims=True)
     tilted = np.einsum("vij,vi->vj", normal_moments, to_vertex)
@@ -250,7 +254,13 @@ class HatClusters:
                 np.matmul(terms[part].T, functions[part], out=sums[cluster])
 
         team.each(fill, range(len(sizes)))
-        return cls(np.concatenate(centres), np.concatenate(radii), level_starts, sums, n_hats)
+        return cls(
+            centres=np.concatenate(centres),
+            radii=np.concatenate(radii),
+            level_starts=level_starts,
+            sums=sums,
+            n_hats=n_hats,
+        )
 
     def far_clusters(self, x: Floats, ratio: float) -> tuple[Integers, Integers]:
         """Return the clusters that are `ratio` or more radii from the box of points x (3, n), and the other hats."""
@@ -282,7 +292,8 @@ def _cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats) -> F
     spread += _entries(_outer(s, s))
     first = tilt + _entries(_outer(flux, s))
     second = _trace(first) * _SQUARES - 4 * first
-    g = 2 * _trace(tilt) * s + _trace(spread) * flux
+    g = 2 * _trace(tilt) * s
+    g += _trace(spread) * flux
     g += 4 * _times(tilt, s) + 2 * _times(spread, flux)
     third = 12 * _cubic(flux, spread)
     third += 24 * _cubic(s, tilt)

@@ -22,13 +22,21 @@ _N_PAIRS = 128
 # Half-diagonals; points closer than this are on the surface, or in the plane of a face
 _ON_SURFACE = 2e-9
 _TAN = math.tan(math.pi / 8)
-# Coefficients of arctan(√q)/√q for √q ≤ tan π/8, accurate to rounding, from the highest power down.
-_ARCTAN = tuple(
-    Chebyshev.interpolate(lambda q: np.arctan(np.sqrt(q)) / np.sqrt(q), 12, domain=[1e-9, _TAN**2])
-    .convert(kind=Polynomial)
-    .coef[::-1]
-    .tolist()
-)
+
+
+def _arctan_coefficients() -> tuple[float, ...]:
+    """Return coefficients of arctan(√q)/√q for √q ≤ tan π/8, accurate to rounding, from the highest power down."""
+
+    def function(q: Floats) -> Floats:
+        root = np.sqrt(q)
+        return np.arctan(root) / root
+
+    series = Chebyshev.interpolate(function, 12, domain=[1e-9, _TAN**2])
+    polynomial = series.convert(kind=Polynomial)
+    return tuple(polynomial.coef[::-1].tolist())
+
+
+_ARCTAN = _arctan_coefficients()
 
 
 @compiled()
@@ -201,7 +209,12 @@ class Pairs(NamedTuple):
 def pairs_for(n_points: int) -> Pairs:
     """Return the scratch space of `add_near_faces` for n points."""
     m = n_points + _N_PAIRS
-    return Pairs(np.empty((2, m), np.int64), np.empty((3, m)), np.empty((3, m)), np.empty((m, 4)))
+    return Pairs(
+        numbers=np.empty((2, m), np.int64),
+        squares=np.empty((3, m)),
+        cosines=np.empty((3, m)),
+        projections=np.empty((m, 4)),
+    )
 
 
 @compiled()

@@ -88,9 +88,10 @@ def _stiffness(mesh: Mesh, cotangents: Floats) -> sparse.csr_matrix:
     starts = np.roll(mesh.faces, -1, axis=1)
     ends = np.roll(mesh.faces, -2, axis=1)
     edges = (starts.ravel(), ends.ravel())
+    halves = cotangents.ravel() / 2
     n_vertices = len(mesh.vertices)
-    halves = sparse.csr_matrix((cotangents.ravel() / 2, edges), shape=(n_vertices, n_vertices))
-    weights = halves + halves.T
+    directed = sparse.csr_matrix((halves, edges), shape=(n_vertices, n_vertices))
+    weights = directed + directed.T
     row_sums = np.asarray(weights.sum(axis=1))
     return sparse.diags(row_sums.ravel(), format="csr") - weights
 

@@ -17,7 +17,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy.spatial.distance import cdist
 
 from igps._arrays import Floats, Integers
@@ -56,10 +56,10 @@ _MAX_APPROXIMATIONS = 2  # then the closed form is used
 
 
 def extend(
-    vertices: NDArray[np.floating],
-    faces: NDArray[np.integer],
-    functions: NDArray[np.floating],
-    points: NDArray[np.floating],
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    functions: ArrayLike,
+    points: ArrayLike,
     **options: Any,
 ) -> Floats:
     """Extend surface functions (V, K) to points (P, 3); options and errors are those of `Extension`.
@@ -91,9 +91,9 @@ class Extension:
 
     def __init__(
         self,
-        vertices: NDArray[np.floating],
-        faces: NDArray[np.integer],
-        functions: NDArray[np.floating],
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        functions: ArrayLike,
         *,
         divisors: NDArray[np.floating] | None = None,
         accuracy: float | None = None,
@@ -103,8 +103,9 @@ class Extension:
         if dtype is None:
             is_single_enough = accuracy is not None and accuracy >= _MIN_FLOAT32_ACCURACY
             dtype = np.float32 if is_single_enough else np.float64
-        if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
-            raise ValueError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
+        type_name = np.dtype(dtype).name
+        if type_name not in ("float32", "float64"):
+            raise ValueError(f"dtype: expected float32 or float64, got {type_name}")
         scaled, scaled_faces, _ = _scaled(vertices, faces, np.zeros((0, 3)))
         values = np.asarray(functions)
         if values.ndim != 2 or len(values) != len(scaled):
@@ -112,10 +113,11 @@ class Extension:
                 f"functions: expected shape (V, K) with V = {len(scaled)} vertices, got {values.shape}; "
                 "give one row per vertex"
             )
+        # A finite sum implies finite values, and is many times faster to check.
         with np.errstate(over="ignore", invalid="ignore"):
-            # A finite sum implies finite values, and is many times faster to check.
-            if not (np.isfinite(values.sum()) or np.isfinite(values).all()):
-                raise ValueError("functions: expected finite values, got NaN or infinity")
+            total = values.sum()
+        if not np.isfinite(total) and not np.isfinite(values).all():
+            raise ValueError("functions: expected finite values, got NaN or infinity")
         if divisors is not None and np.shape(divisors) != values.shape[1:]:
             raise ValueError(
                 f"divisors: expected shape {values.shape[1:]}, one per function, got {np.shape(divisors)}"
@@ -124,7 +126,8 @@ class Extension:
         order = self._surface.order
         self._n_functions = values.shape[1]
         # Columns of ones sum the weights. One column would do, but whole registers are multiplied faster.
-        n_columns = -(-(self._n_functions + 1) // _REGISTER_SIZE) * _REGISTER_SIZE
+        n_registers = math.ceil((self._n_functions + 1) / _REGISTER_SIZE)
+        n_columns = n_registers * _REGISTER_SIZE
         self._columns = np.ones((len(order), n_columns), dtype)
         for start in range(0, len(order), _COPY_ROWS):
             part = slice(start, start + _COPY_ROWS)
@@ -136,7 +139,7 @@ class Extension:
         self._faces = faces
         self._accuracy = accuracy
 
-    def __call__(self, points: NDArray[np.floating]) -> Floats:
+    def __call__(self, points: ArrayLike) -> Floats:
         """Return the values (P, K) at points (P, 3); a ValueError if a sum of weights is zero."""
         _, _, scaled_points = _scaled(self._vertices, self._faces, points)
         x = scaled_points @ self._surface.axes
@@ -168,7 +171,8 @@ class Extension:
 
     def _values(self, sums: NDArray[np.floating]) -> NDArray[np.floating]:
         totals = sums[:, -1:]
-        if not (np.isfinite(totals) & (totals != 0)).all():
+        is_usable = np.isfinite(totals) & (totals != 0)
+        if not is_usable.all():
             raise ValueError(
                 "points: expected mean value weights with a non-zero sum, got 0 or inf; close the mesh"
             )
@@ -204,8 +208,8 @@ class Extension:
                 if clusters is not None:
                     fill_clusters(block_points, far, clusters.centres, clusters.radii, weights)
                 surface.fill_weights(block_points, hats, hat_ratio, weights)
-                sums = weights.astype(columns.dtype, copy=False).T @ values
-                results.append((rows, sums))
+                weights = weights.astype(columns.dtype, copy=False)
+                results.append((rows, weights.T @ values))
             return results
 
         n_threads = None if len(columns) >= _MIN_TEAM_VERTICES else 1
@@ -235,14 +239,17 @@ class Extension:
 
         chosen = at_steps(_N_CHECKED)
         chosen_points = np.ascontiguousarray(x[chosen].T)
-        weights = np.empty((len(self._surface.order), len(chosen)))
-        self._surface.fill_weights(chosen_points, np.arange(len(weights)), math.inf, weights)
-        exact = self._values(weights.astype(self._columns.dtype, copy=False).T @ self._columns)
+        n_hats = len(self._columns)
+        weights = np.empty((n_hats, len(chosen)))
+        self._surface.fill_weights(chosen_points, np.arange(n_hats), math.inf, weights)
+        weights = weights.astype(self._columns.dtype, copy=False)
+        exact = self._values(weights.T @ self._columns)
         checked = values[chosen]
         others = values[at_steps(_N_CHECK_PARTNERS)]
         # To first order, a distance d changes by error · (checked − others) / d.
         errors = checked - exact
-        changes = (errors * checked).sum(axis=1, keepdims=True) - errors @ others.T
+        along_checked = (errors * checked).sum(axis=1, keepdims=True)
+        changes = along_checked - errors @ others.T
         squared = cdist(checked, others, "sqeuclidean")
         is_apart = squared > 0
         if not is_apart.any():
@@ -261,7 +268,7 @@ def _far_ratios(accuracy: float | None) -> tuple[float, float]:
 
 
 def _scaled(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
+    vertices: ArrayLike, faces: ArrayLike, points: ArrayLike
 ) -> tuple[Floats, Integers, Floats]:
     """Check the arguments; return vertices, faces and points, with lengths scaled to the mesh."""
     vertices, faces, points = check_mesh_and_points(vertices, faces, points)

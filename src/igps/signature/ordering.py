@@ -47,7 +47,8 @@ def ordering_keys(
     scaled = eigenvalues * area
     weights = np.sqrt(area / scaled) * np.exp(-scaled / _CUTOFF)
     n_used = int((weights > _MIN_WEIGHT * weights[0]).sum())  # weights decrease
-    return _keys(eigenfunctions[:, :n_used] * weights[:n_used], tie_breakers)
+    embedding = eigenfunctions[:, :n_used] * weights[:n_used]
+    return _keys(embedding, tie_breakers)
 
 
 def spatial_ordering_keys(mesh: Mesh) -> Floats:
@@ -98,7 +99,8 @@ def nearest_spacing(points: Floats) -> Floats:
 
 def vertex_area_shares(faces: Integers, areas: Floats) -> Floats:
     """Return the area of the faces (F, 3) around each vertex, over its mean: tie-breakers (V,) of `ordering_keys`."""
-    around = np.bincount(faces.ravel(), weights=np.repeat(areas, 3))
+    at_corners = np.repeat(areas, 3)
+    around = np.bincount(faces.ravel(), weights=at_corners)
     return around / around.mean()
 
 
@@ -136,7 +138,8 @@ def spatial_order(points: Floats, size: int) -> Integers:
         along = boxes[longest, np.arange(n_boxes)]
         order = order.reshape(along.shape)
         along[order == n_points] = np.inf
-        halves = np.argpartition(along, along.shape[1] // 2 - 1, axis=1)
+        last_left = along.shape[1] // 2 - 1
+        halves = np.argpartition(along, last_left, axis=1)
         order = np.take_along_axis(order, halves, axis=1).ravel()
     return order[order < n_points]
 
@@ -145,5 +148,6 @@ def principal_axes(points: Floats) -> Floats:
     """Return the principal axes of points (n, 3) as columns (3, 3); each points towards the longer tail."""
     centred = points - points.mean(axis=0)
     axes = np.linalg.eigh(centred.T @ centred).eigenvectors
-    skewness = ((centred @ axes) ** 3).sum(axis=0)
+    coordinates = centred @ axes
+    skewness = (coordinates**3).sum(axis=0)
     return np.where(skewness < 0, -axes, axes)

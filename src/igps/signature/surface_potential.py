@@ -67,7 +67,13 @@ def _series(corners: Floats, accuracy: float) -> Floats:
     forms = 1.5 * covariances - 0.5 * round_parts
     diagonals = np.diagonal(forms, axis1=1, axis2=2)
     mixed = 2 * forms[:, (0, 0, 1), (1, 2, 2)]
-    columns = [centres, limits[:, None], areas, areas * diagonals, areas * mixed]
+    columns = [
+        centres,
+        limits[:, None],
+        areas,
+        areas * diagonals,
+        areas * mixed,
+    ]
     return np.concatenate(columns, axis=1)
 
 

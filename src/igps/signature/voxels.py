@@ -90,13 +90,13 @@ def grid_axes(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Floats]:
     middle = (low + high) / 2
     cell = sides.max() / resolution
     # A small tolerance keeps a side of exactly n cells at n cells in spite of rounding.
-    counts = np.maximum(np.ceil(sides / cell - 1e-6), 1).astype(int)
-
-    def centres_along(axis: int) -> Floats:
-        from_middle = np.arange(counts[axis]) - (counts[axis] - 1) / 2
-        return middle[axis] + from_middle * cell
-
-    return centres_along(0), centres_along(1), centres_along(2)
+    counts = np.ceil(sides / cell - 1e-6).clip(1)
+    axes = []
+    for centre, count in zip(middle, counts, strict=True):
+        from_middle = np.arange(count) - (count - 1) / 2
+        axes.append(centre + from_middle * cell)
+    x_axis, y_axis, z_axis = axes
+    return x_axis, y_axis, z_axis
 
 
 def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
@@ -112,10 +112,9 @@ def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
     for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         first, second, third = order
         scanned = (axes[first], axes[second], axes[third])
-        after, before, touching = _scan(mesh.vertices[:, order], mesh.faces, scanned)
+        voting, touching = _scan(mesh.vertices[:, order], mesh.faces, scanned)
         back = np.argsort(order)
-        votes += (after > 0).transpose(back)
-        votes += (before > 0).transpose(back)
+        votes += voting.transpose(back)
         on_surface |= touching.transpose(back)
     inside = votes >= 5
     is_doubtful = (votes > 1) & (votes < 5) & ~on_surface
@@ -126,15 +125,44 @@ def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
 
 
 def _scan(
-    vertices: Floats, faces: Integers, axes: tuple[Floats, ...]
-) -> tuple[NDArray[np.int32], NDArray[np.int32], Booleans]:
-    """Return sums of signed crossings along the first axis, after and before each point, and points on the surface.
+    vertices: Floats, faces: Integers, axes: tuple[Floats, Floats, Floats]
+) -> tuple[NDArray[np.int8], Booleans]:
+    """Return how many sums of signed crossings along the first axis say inside, of those after and before each point.
+
+    Return also which points are on the surface.
+    """
+    x_axis, y_axis, z_axis = axes
+    crossing, column, row, signs = _crossings(vertices, faces, y_axis, z_axis)
+    # A crossing counts for all points of its line with smaller x: enter it where their suffix sum starts.
+    position = np.searchsorted(x_axis, crossing)
+    size = (len(x_axis) + 1, len(y_axis), len(z_axis))
+    flat = np.ravel_multi_index((position, column, row), size)
+    counts = np.bincount(flat, weights=signs, minlength=math.prod(size))
+    crossings = counts.reshape(size).astype(np.int32)
+    # The points with smaller x than a crossing have indices below its position.
+    after = np.cumsum(crossings[::-1], axis=0)[::-1]
+    before = -np.cumsum(crossings, axis=0)
+    votes = (after[1:] > 0).astype(np.int8)
+    votes += before[:-1] > 0
+
+    on_surface = np.zeros(size, dtype=bool)
+    cell = _cell_size(axes, vertices)
+    for neighbour in (position - 1, position):
+        neighbour = np.clip(neighbour, 0, len(x_axis) - 1)
+        is_close = np.abs(x_axis[neighbour] - crossing) < _ON_SURFACE * cell
+        on_surface[neighbour[is_close], column[is_close], row[is_close]] = True
+    return votes, on_surface[:-1]
+
+
+def _crossings(
+    vertices: Floats, faces: Integers, y_axis: Floats, z_axis: Floats
+) -> tuple[Floats, Integers, Integers, Integers]:
+    """Return where lines along x, through points of a grid, cross the surface: x, index of y, index of z, and sign.
 
     Every comparison belongs to one edge and has the same result in both faces of the edge. A line through an edge or a
     vertex therefore crosses exactly one of the faces that meet there: ties are resolved as if the line were moved by an
     infinitesimal amount (Edelsbrunner and Mücke 1990), never by rounding.
     """
-    x_axis, y_axis, z_axis = axes
     # Rows: where each edge crosses each plane z = const, half-open in z. The edge runs from its lower to its upper end
     # whatever the face, so both faces compute the same point.
     start, end = directed_edges(faces)
@@ -161,32 +189,14 @@ def _scan(
     first = np.minimum(column_down, column_up)
     last = np.maximum(column_down, column_up)
     segment, column = _ranges(first, last)
-    row = row[segment]
     # +1 where the outward normal points towards +x: seen from there, the upward edge has the larger y.
     signs = np.where(column_up > column_down, 1, -1)[segment]
+    row = row[segment]
     down = down[segment]
     up = up[segment]
     t = (y_axis[column] - y[down]) / (y[up] - y[down])
     crossing = x[down] + t * (x[up] - x[down])
-
-    # A crossing counts for all points of its line with smaller x: enter it where their suffix sum starts.
-    position = np.searchsorted(x_axis, crossing)
-    size = (len(x_axis) + 1, len(y_axis), len(z_axis))
-    flat = np.ravel_multi_index((position, column, row), size)
-    counts = np.bincount(flat, weights=signs, minlength=math.prod(size))
-    crossings = counts.reshape(size).astype(np.int32)
-    # The points with smaller x than a crossing have indices below its position.
-    from_end = np.cumsum(crossings[::-1], axis=0)
-    after = from_end[::-1][1:]
-    before = -np.cumsum(crossings, axis=0)[:-1]
-
-    on_surface = np.zeros(size, dtype=bool)
-    cell = _cell_size(axes, vertices)
-    for neighbour in (position - 1, position):
-        neighbour = np.clip(neighbour, 0, len(x_axis) - 1)
-        is_close = np.abs(x_axis[neighbour] - crossing) < _ON_SURFACE * cell
-        on_surface[neighbour[is_close], column[is_close], row[is_close]] = True
-    return after, before, on_surface[:-1]
+    return crossing, column, row, signs
 
 
 def _cell_size(axes: tuple[Floats, ...], vertices: Floats) -> float:

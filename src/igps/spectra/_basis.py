@@ -38,7 +38,8 @@ class Basis:
         self._basis[0] = torch.from_numpy(first_row)
         if self._single is not None:
             self._single[0] = self._basis[0]
-        self._projected = torch.zeros(capacity + 1, capacity + 1, dtype=torch.float64, device="cpu")
+        shape = (capacity + 1, capacity + 1)
+        self._projected = torch.zeros(shape, dtype=torch.float64, device="cpu")
         # Rows before _stop are filled. Rows before _n_orthogonal are orthogonal to all rows before them, later rows
         # only to the neighbouring blocks.
         self._stop = self._n_orthogonal = 1
@@ -112,5 +113,5 @@ class Basis:
 
 
 def split(size: int, number: int) -> list[slice]:
-    cuts = np.linspace(0, size, number + 1).astype(int).tolist()
-    return [slice(begin, end) for begin, end in pairwise(cuts)]
+    cuts = np.linspace(0, size, number + 1).astype(int)
+    return [slice(begin, end) for begin, end in pairwise(cuts.tolist())]

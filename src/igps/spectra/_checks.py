@@ -31,7 +31,8 @@ def checked_entries(
 ) -> sparse.csr_array:
     """Return the canonical matrix, and check that it stores the same entries as a known structure."""
     matrix = canonical(matrix)
-    if not (np.array_equal(matrix.indptr, indptr) and np.array_equal(matrix.indices, indices)):
+    has_same_rows = np.array_equal(matrix.indptr, indptr)
+    if not has_same_rows or not np.array_equal(matrix.indices, indices):
         raise ValueError(
             "matrix: expected the stored entries of the analysed matrix, got others. Analyse it anew."
         )
@@ -43,7 +44,8 @@ def checked_mass(mass: np.ndarray | sparse.sparray | sparse.spmatrix) -> np.ndar
     if not sparse.issparse(mass):
         return np.array(mass, dtype=np.float64)
     entries = sparse.coo_array(mass)
-    if mass.shape[0] != mass.shape[1] or np.any(entries.data[entries.row != entries.col]):
+    off_diagonal = entries.data[entries.row != entries.col]
+    if mass.shape[0] != mass.shape[1] or np.any(off_diagonal):
         raise ValueError(
             f"mass: expected (V,) or a diagonal sparse matrix, got a sparse matrix of shape {mass.shape} that is not "
             "diagonal. Lump it: mass.sum(axis=1)."
@@ -89,12 +91,14 @@ def checked_stiffness(
     arrays = ((matrix.indptr, matrix.indices, matrix.data) for matrix in (stiffness, transpose))
     is_symmetric = all(map(np.array_equal, *arrays))
     magnitude = abs(stiffness)
-    if not is_symmetric and abs(stiffness - transpose).max() > TOLERANCE * magnitude.max():
+    asymmetry = 0.0 if is_symmetric else abs(stiffness - transpose).max()
+    if asymmetry > TOLERANCE * magnitude.max():
         raise ValueError(
             "stiffness: expected a symmetric matrix, got one that differs from its transpose."
         )
     # Relative to each row, so that the zero mode is recognised at any scale and in spite of slivers.
-    if (np.abs(stiffness.sum(axis=1)) > TOLERANCE * magnitude.sum(axis=1)).any():
+    row_sums = np.abs(stiffness.sum(axis=1))
+    if (row_sums > TOLERANCE * magnitude.sum(axis=1)).any():
         raise ValueError(
             "stiffness: expected rows that sum to zero, as the constant is an eigenfunction on a closed surface; got "
             "other sums."

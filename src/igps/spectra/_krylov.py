@@ -125,7 +125,8 @@ class Krylov(Basis):
     def widen(self) -> None:
         """Enlarge the last block, and those after it, by random vectors, for directions that the start block lacked."""
         self._reorthogonalise()
-        block, _ = self._orthonormal(self._random(self._block_size), near=self._previous)
+        directions = self._random(self._block_size)
+        block, _ = self._orthonormal(directions, near=self._previous)
         self._append(block, is_orthogonal=True)
         uncoupled = self._coupling.new_zeros(len(block), self._coupling.shape[1])
         self._coupling = torch.cat([self._coupling, uncoupled])

@@ -73,9 +73,8 @@ def lanczos(
     with Team(None if n_eigenpairs * len(zero_mode) >= MIN_TEAM_RESULT else 1) as team:
         shift, factors = _factorize_inside(tree, matrix, zero_mode, n_eigenpairs, tolerance, team)
         n_below = factors.n_negative - 1  # without the zero mode
-        krylov = Krylov(
-            factors, zero_mode, block_size, first_size + 3 * block_size, generator, team
-        )
+        capacity = first_size + 3 * block_size
+        krylov = Krylov(factors, zero_mode, block_size, capacity, generator, team)
         while krylov.size < first_size:
             krylov.expand()
         while True:
@@ -86,12 +85,12 @@ def lanczos(
                 n_found, bound = gap
                 wanted = converged[:n_eigenpairs]
                 count = partial(tree.inertia, matrix, bound, team)
-                if (
-                    krylov.overwrites_basis
-                ):  # count first: if some are missing, the basis is still needed
+                if krylov.overwrites_basis:
+                    # Count first: if some are missing, the basis is still needed.
                     vectors = None
                     n_negative = count()
-                else:  # count and compute the vectors in parallel
+                else:
+                    # Count and compute the vectors in parallel.
                     vectors, fill_steps = krylov.eigenvectors(ritz, wanted, order)
                     steps: list[Callable[[], Any]] = [count, *fill_steps]
                     n_negative = team.each(call, steps)[0]
@@ -109,9 +108,8 @@ def lanczos(
                 raise ConvergenceError(
                     f"found {len(converged)} of {n_eigenpairs} pairs with a basis of {krylov.size}"
                 )
-            if (
-                gap is not None or krylov.size > max_size / 2
-            ):  # pairs are missing, or convergence is slow
+            # Pairs are missing, or convergence is slow.
+            if gap is not None or krylov.size > max_size / 2:
                 krylov.widen()
             for _ in range(2):
                 krylov.expand()
@@ -137,7 +135,8 @@ def _factorize_inside(
         factors = tree.factorize(matrix, shift, team)
         rank = factors.n_negative
         off_target = max(0.0, abs(rank - target) - 0.2 * target - 1)
-        defect = float(torch.linalg.norm(shift * factors.solve(mode, team) + mode))
+        solution = factors.solve(mode, team)
+        defect = float(torch.linalg.norm(shift * solution + mode))
         logger.debug("shift %.6g: %d eigenvalues below, defect %.1e", shift, rank, defect)
         if best is None or (off_target, defect) < best[:2]:
             best = off_target, defect, shift, factors
@@ -161,4 +160,5 @@ def gap_after(eigenvalues: torch.Tensor, n_eigenpairs: int) -> tuple[int, float]
     index = int(wide_gaps[0]) if len(wide_gaps) else int(gaps.argmax())
     if gaps[index] < MIN_GAP:
         return None
-    return n_eigenpairs + index, float(values[index] + values[index + 1]) / 2
+    middle = float(values[index] + values[index + 1]) / 2
+    return n_eigenpairs + index, middle

@@ -42,14 +42,14 @@ def checked_graph(
     matrix = canonical(matrix)
     n_vertices = matrix.shape[0]
     transpose = matrix.tocsc()
-    if not (
-        np.array_equal(transpose.indptr, matrix.indptr)
-        and np.array_equal(transpose.indices, matrix.indices)
-    ):
+    is_symmetric = np.array_equal(transpose.indptr, matrix.indptr)
+    is_symmetric &= np.array_equal(transpose.indices, matrix.indices)
+    if not is_symmetric:
         raise ValueError(
             "matrix: expected entry (j, i) wherever (i, j) is stored, got an asymmetric pattern."
         )
-    rows = np.repeat(np.arange(n_vertices), np.diff(matrix.indptr))
+    n_entries = np.diff(matrix.indptr)
+    rows = np.repeat(np.arange(n_vertices), n_entries)
     if np.count_nonzero(rows == matrix.indices) != n_vertices:
         raise ValueError(
             "matrix: expected all diagonal entries to be stored, got fewer. Store zeros explicitly."

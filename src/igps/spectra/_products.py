@@ -156,18 +156,16 @@ def product(
     """
     m, n, k = shape
     is_added = add != 0
+    is_wide = n >= COLUMNS
     for i in range(0, m, ROWS):
         size = (min(ROWS, m - i), k)
         columns = (a[0], a[1] + i * a[3], a[2], a[3])
-        if n < COLUMNS:
-            for j in range(n):
-                source_rows = (source[0], source[1] + i * source[2] + j, source[2])
-                out_rows = (out[0], out[1] + i * out[2] + j, out[2])
-                x_rows = (x[0], x[1] + j, x[2])
-                narrow_tile(columns, x_rows, is_added, source_rows, out_rows, size, scale)
-        for begin in range(0, n if n >= COLUMNS else 0, COLUMNS):
-            j = min(begin, n - COLUMNS)
+        for begin in range(0, n, COLUMNS if is_wide else 1):
+            j = min(begin, n - COLUMNS) if is_wide else begin
             source_rows = (source[0], source[1] + i * source[2] + j, source[2])
             out_rows = (out[0], out[1] + i * out[2] + j, out[2])
             x_rows = (x[0], x[1] + j, x[2])
-            tile(columns, x_rows, is_added, source_rows, out_rows, size, scale)
+            if is_wide:
+                tile(columns, x_rows, is_added, source_rows, out_rows, size, scale)
+            else:
+                narrow_tile(columns, x_rows, is_added, source_rows, out_rows, size, scale)

@@ -117,11 +117,10 @@ def eigenpairs(
     """
     mass = checked_mass(mass)
     stiffness = checked_stiffness(stiffness, mass, n_eigenpairs)
-    if positions is not None and (
-        positions.shape != (len(mass), 3) or not np.isfinite(positions).all()
-    ):
+    shape = (len(mass), 3)
+    if positions is not None and (positions.shape != shape or not np.isfinite(positions).all()):
         raise ValueError(
-            f"positions: expected finite values of shape ({len(mass)}, 3), got {positions.shape}."
+            f"positions: expected finite values of shape {shape}, got {positions.shape}."
         )
 
     area = mass.sum()
@@ -140,7 +139,8 @@ def eigenpairs(
         eigenvalues, eigenfunctions = _arpack(stiffness, mass, n_computed, seed)
         eigenvalues *= area
         _prove_complete(matrix, eigenvalues, n_eigenpairs, positions)
-        return eigenvalues[:n_eigenpairs], eigenfunctions[:, :n_eigenpairs] * np.sqrt(mass)[:, None]
+        vectors = eigenfunctions[:, :n_eigenpairs] * np.sqrt(mass)[:, None]
+        return eigenvalues[:n_eigenpairs], vectors
 
     is_small = len(mass) <= max(MAX_DENSE_VERTICES, MAX_DENSE_VERTICES_PER_EIGENPAIR * n_eigenpairs)
     try:
@@ -233,11 +233,8 @@ def _residual(
         residuals = np.linalg.norm(defects, axis=0) / np.abs(values)
         largest = max(largest, float(residuals.max()))
         if not (residuals <= tolerance).all():
-            rounding = (
-                np.linalg.norm(abs(matrix) @ np.abs(vectors[:, part]), axis=0)
-                * ROUNDING
-                / np.abs(values)
-            )
+            magnitudes = abs(matrix) @ np.abs(y)
+            rounding = np.linalg.norm(magnitudes, axis=0) * ROUNDING / np.abs(values)
             allowed = np.maximum(tolerance, np.minimum(tolerance + rounding, RESIDUAL_LIMIT))
             failed = ~(residuals <= allowed)
             if failed.any():

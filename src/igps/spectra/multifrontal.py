@@ -122,16 +122,22 @@ class Tree:
         structure = self.structure
         own_sizes = structure.n_own[node:end]
         widths = own_sizes + structure.n_boundary[node:end]
-        front = np.empty(widths.max() ** 2)
         if blocks is None:  # each block overwrites the previous one
             blocks = np.empty((own_sizes * widths).max())
             table = structure.nodes.copy()
             table[BLOCK] = 0
             structure = structure._replace(nodes=table)
         padded = min(MAX_COMPILED, int(own_sizes.max())) + loops.STEP
-        squares = [np.empty(padded**2) for _ in range(3)]
-        strips = [np.empty(loops.STEP * (padded + loops.STEP)) for _ in range(2)]
-        scratch = Scratch(np.empty(len(structure.order), dtype=np.int64), front, *squares, *strips)
+        strip_size = loops.STEP * (padded + loops.STEP)
+        scratch = Scratch(
+            boundary_row=np.empty(len(structure.order), dtype=np.int64),
+            front=np.empty(widths.max() ** 2),
+            inverse=np.empty(padded**2),
+            pivot_copy=np.empty(padded**2),
+            residual=np.empty(padded**2),
+            rows=np.empty(strip_size),
+            columns=np.empty(strip_size),
+        )
         n_negative = 0
         while True:
             n_new, node = loops.eliminate(
@@ -144,7 +150,7 @@ class Tree:
             n_boundary = int(structure.n_boundary[node])
             width = n_own + n_boundary
             n_negative += _eliminate_node(
-                _matrix(front, 0, (width, width)),
+                _matrix(scratch.front, 0, (width, width)),
                 _matrix(blocks, structure.nodes[BLOCK, node], (n_own, width)),
                 _matrix(updates, structure.nodes[UPDATE, node], (n_boundary, n_boundary)),
                 team,
@@ -167,13 +173,15 @@ class Factors:
         n_vertices, b = right_hand_sides.shape
         right = right_hand_sides.T.contiguous().numpy()
         solution = torch.empty(b, n_vertices, dtype=torch.float64, device="cpu")
-        n_boundary = structure.n_boundary
         x = np.empty(n_vertices * b)
-        carried = np.empty((structure.nodes[CARRIED, :-1] + n_boundary).max() * b)
-        size = int((structure.n_own + n_boundary).max()) * b
+        ends = structure.nodes[CARRIED, :-1] + structure.n_boundary
+        carried = np.empty(ends.max() * b)
+        widths = structure.n_own + structure.n_boundary
+        size = int(widths.max()) * b
 
         def forward(nodes: Nodes) -> None:
-            loops.forward(nodes, right, structure, self.blocks, x, carried, np.empty(size))
+            rows = np.empty(size)
+            loops.forward(nodes, right, structure, self.blocks, x, carried, rows)
 
         def backward(nodes: Nodes) -> None:
             rows, boundary_x = np.empty((2, size))
@@ -226,7 +234,8 @@ def _eliminate_node(
     block[:, :n_own] = inverse
     elimination = block[:, n_own:]
     trailing = front[n_own:, n_own:]
-    pieces = [slice(begin, begin + PIECE_SIZE) for begin in range(0, n_boundary, PIECE_SIZE)]
+    begins = range(0, n_boundary, PIECE_SIZE)
+    pieces = [slice(begin, begin + PIECE_SIZE) for begin in begins]
 
     def eliminate(piece: slice) -> None:
         elimination[:, piece] = -(inverse @ coupling[:, piece])

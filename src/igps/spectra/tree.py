@@ -90,8 +90,9 @@ def tree_structure(
     nodes[BOUNDARY] = boundary_start
     nodes[[LEFT, RIGHT], :-1] = children.T
     nodes[BLOCK, 1:] = np.cumsum(n_own * (n_own + n_boundary))
-    nodes[UPDATE, :-1] = stack_starts(children, n_boundary**2, [*subtrees, *above])
-    nodes[CARRIED, :-1] = stack_starts(children, n_boundary, [*subtrees, *above])
+    ranges = [*subtrees, *above]
+    nodes[UPDATE, :-1] = stack_starts(children, n_boundary**2, ranges)
+    nodes[CARRIED, :-1] = stack_starts(children, n_boundary, ranges)
     structure = Structure(indptr, indices, order, position, nodes, boundary, parent_row)
     return structure, subtrees, above
 
@@ -102,7 +103,8 @@ def _full_tree(n_levels: int) -> tuple[Integers, Integers]:
     node_at = np.full(n_nodes, n_nodes - 1)
     children = np.full((n_nodes, 2), -1)
     for level in range(n_levels - 1):
-        places = np.arange(2**level - 1, 2 ** (level + 1) - 1)
+        n_places = 2**level
+        places = n_places - 1 + np.arange(n_places)
         parents = node_at[places]
         right = parents - 1
         left = right - (2 ** (n_levels - level - 1) - 1)  # the whole right subtree lies between
