@@ -209,7 +209,8 @@ class Extension:
                     fill_clusters(block_points, far, clusters.centres, clusters.radii, weights)
                 surface.fill_weights(block_points, hats, hat_ratio, weights)
                 weights = weights.astype(columns.dtype, copy=False)
-                results.append((rows, weights.T @ values))
+                sums: NDArray[np.floating] = weights.T @ values
+                results.append((rows, sums))
             return results
 
         n_threads = None if len(columns) >= _MIN_TEAM_VERTICES else 1
