@@ -1,6 +1,7 @@
 """The benchmark of graded shapes: classes, bodies of a class, individuals of a body, and poses."""
 
 import contextlib
+import itertools
 import logging
 import operator
 import os
@@ -111,7 +112,8 @@ class GradedShapes:
         return self.n_classes * self.n_bodies * max(self.n_individuals, 1) * self.n_poses
 
     def __repr__(self) -> str:
-        return f"GradedShapes({', '.join(f'{name}={value!r}' for name, value in self.__getstate__().items())})"
+        arguments = [f"{name}={value!r}" for name, value in self.__getstate__().items()]
+        return f"GradedShapes({', '.join(arguments)})"
 
     @property
     def class_names(self) -> list[str]:
@@ -121,16 +123,18 @@ class GradedShapes:
     @property
     def labels(self) -> list[str]:
         """The class of every shape."""
-        return [name for name in self.class_names for _ in range(len(self) // self.n_classes)]
+        n_each = len(self) // self.n_classes
+        return [name for name in self.class_names for _ in range(n_each)]
 
     @property
     def names(self) -> list[str]:
         """The unique name of every shape, `class/body/pose` or `class/body/individual/pose`."""
+        individuals = [f"{i:02d}/" for i in range(self.n_individuals)] or [""]
         return [
             f"{name}/{body:02d}/{individual_prefix}{pose:02d}"
             for name in self.class_names
             for body in range(self.n_bodies)
-            for individual_prefix in [f"{i:02d}/" for i in range(self.n_individuals)] or [""]
+            for individual_prefix in individuals
             for pose in range(self.n_poses)
         ]
 
@@ -172,9 +176,10 @@ class GradedShapes:
         The pose is that of the first attempt, which is the pose of the shape unless this attempt failed.
         """
         body_class, number, individual_number, pose = self._numbers(index)
+        body = self._individual(body_class, number, individual_number)
         rng = self._pose_generator(body_class, number, individual_number, pose, 0)
         scan = Scan.draw(rng, self.n_vertices)
-        return draw_pose(self._individual(body_class, number, individual_number), rng, scan.target)
+        return draw_pose(body, rng, scan.target)
 
     def write(
         self, root: str | os.PathLike[str], progress: bool = False, n_workers: int | None = 1
@@ -205,24 +210,20 @@ class GradedShapes:
         names = self.names
         missing = [i for i, name in enumerate(names) if not (folder / f"{name}.off").exists()]
         # A job has all missing poses of a body, so that the body is drawn once.
-        jobs: dict[int, list[int]] = {}
-        for i in missing:
-            jobs.setdefault(i // (self.n_poses * max(self.n_individuals, 1)), []).append(i)
+        n_each = self.n_poses * max(self.n_individuals, 1)
+        jobs = [list(of_body) for _, of_body in itertools.groupby(missing, lambda i: i // n_each)]
         failed = []
-        with (
-            tqdm(
-                total=len(names),
-                initial=len(names) - len(missing),
-                desc="shapes",
-                unit="shape",
-                disable=not progress,
-            ) as bar,
-            contextlib.closing(
-                run(partial(_write, self, folder), list(jobs.values()), n_workers=n_workers)
-            ) as results,
-        ):
-            for number, outcome in results:
-                bar.update(len(list(jobs.values())[number]))
+        bar = tqdm(
+            total=len(names),
+            initial=len(names) - len(missing),
+            desc="shapes",
+            unit="shape",
+            disable=not progress,
+        )
+        outcomes = run(partial(_write, self, folder), jobs, n_workers=n_workers)
+        with bar, contextlib.closing(outcomes):
+            for number, outcome in outcomes:
+                bar.update(len(jobs[number]))
                 if isinstance(outcome, Failed):
                     failed.append(outcome.reason)
         if failed:
@@ -252,28 +253,24 @@ class GradedShapes:
             return body
         key = (body_class, number, individual_number)
         if self._last_individual is None or self._last_individual[0] != key:
-            self._last_individual = (
-                key,
-                individual(body, np.random.default_rng([self.seed, _INDIVIDUAL, *key])),
-            )
+            rng = np.random.default_rng([self.seed, _INDIVIDUAL, *key])
+            self._last_individual = key, individual(body, rng)
         return self._last_individual[1]
 
     def _body(self, body_class: int, number: int) -> Body:
         if self._last is None or self._last[0] != (body_class, number):
             kin = [self.seed, _KIN, body_class, number // _N_SIBLINGS]
+            seed = [self.seed, _BODY, body_class, number]
             drawn: Body | ValueError
             try:
-                drawn = draw_body(
-                    self._classes[body_class], kin, [self.seed, _BODY, body_class, number]
-                )
-            except (
-                ValueError
-            ) as error:  # also stored, because no other pose of the body can be made either
+                drawn = draw_body(self._classes[body_class], kin, seed)
+            except ValueError as error:  # kept, as no other pose of the body can be made either
                 drawn = error
             self._last = (body_class, number), drawn
-        if isinstance(self._last[1], ValueError):
-            raise self._last[1]
-        return self._last[1]
+        _, body = self._last
+        if isinstance(body, ValueError):
+            raise body
+        return body
 
     def _failure(self, name: str, reason: str) -> ValueError:
         return ValueError(

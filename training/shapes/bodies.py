@@ -44,23 +44,21 @@ class Warp:
     @classmethod
     def draw(cls, rng: np.random.Generator, size: float, strength: float) -> Warp:
         """Draw a warp of a body of extent `size`: wavelengths of about `size`, gradients of about `strength`."""
-        waves = rng.normal(size=(3, 3)) * (2.0 * np.pi / (1.3 * size) / np.sqrt(3.0))
-        steps = (
-            rng.normal(size=(3, 3))
-            * (strength / np.sqrt(3.0))
-            / np.linalg.norm(waves, axis=1, keepdims=True)
-        )
+        frequency = 2.0 * np.pi / (1.3 * size)
+        waves = rng.normal(size=(3, 3)) * (frequency / np.sqrt(3.0))
+        gradients = rng.normal(size=(3, 3)) * (strength / np.sqrt(3.0))
         return cls(
-            np.exp(strength * rng.uniform(-1.0, 1.0, 3)),
-            waves,
-            steps,
-            rng.uniform(0.0, 2.0 * np.pi, 3),
+            stretch=np.exp(strength * rng.uniform(-1.0, 1.0, 3)),
+            waves=waves,
+            steps=gradients / np.linalg.norm(waves, axis=1, keepdims=True),
+            phases=rng.uniform(0.0, 2.0 * np.pi, 3),
         )
 
     def __call__(self, points: Floats) -> Floats:
         moved = points * self.stretch
         for wave, step, phase in zip(self.waves, self.steps, self.phases, strict=True):
-            moved = moved + np.sin((points * wave).sum(axis=1) + phase)[:, None] * step
+            angles = (points * wave).sum(axis=1) + phase
+            moved = moved + np.sin(angles)[:, None] * step
         return moved
 
 
@@ -82,18 +80,16 @@ class Body:
 
     def surface(self, target: int, rotation: Floats) -> tuple[Floats, Integers]:
         """Mesh the surface at rest, before the warp, with about `target` vertices, on a grid rotated by `rotation`."""
-        turned = [
-            replace(
-                solid,
-                rotation=_product(rotation, solid.rotation),
-                offset=(rotation * solid.offset).sum(axis=1),
-            )
-            for solid in self.placed
-        ]
+        turned = []
+        for solid in self.placed:
+            axes = (rotation[:, :, None] * solid.rotation[None]).sum(axis=1)
+            offset = (rotation * solid.offset).sum(axis=1)
+            turned.append(replace(solid, rotation=axes, offset=offset))
         vertices, faces, _ = mesh(turned, target)
         vertices = (vertices[:, :, None] * rotation[None]).sum(axis=1)
         amplitude, wavelength, seed = self.relief
-        return roughen(vertices, faces, amplitude, wavelength, np.random.default_rng(seed)), faces
+        rng = np.random.default_rng(seed)
+        return roughen(vertices, faces, amplitude, wavelength, rng), faces
 
 
 @dataclass(frozen=True)
@@ -122,10 +118,12 @@ def draw_body(body_class: BodyClass, kin: Sequence[int], seed: Sequence[int]) ->
         # Later draws deviate less: most failures are parts that meet, or parts that are too thin for the grid.
         rng = np.random.default_rng([*seed, draw])
         spread = rng.uniform(*_SPREAD) * (1.0 - 0.7 * draw / _MAX_DRAWS)
-        body = _draw_candidate(body_class, np.random.default_rng([*kin, draw]), rng, spread)
+        of_skeleton = np.random.default_rng([*kin, draw])
+        body = _draw_candidate(body_class, of_skeleton, rng, spread)
         for rotation in (np.eye(3), _random_rotation(rng)):
             vertices, faces = body.surface(_TRIAL_VERTICES, rotation)
-            fault = _fault(body.warp(vertices), faces, body.genus, _TRIAL_VERTICES)
+            rest = body.warp(vertices)
+            fault = _fault(rest, faces, body.genus, _TRIAL_VERTICES)
             if fault is not None:
                 break
         else:
@@ -149,11 +147,11 @@ def draw_pose(body: Body, rng: np.random.Generator, target: int) -> Pose:
     rig = body.rig
     if body.motion == "sheet":
         angle = rng.uniform(0.0, np.pi)
-        rig = _rig(body.bones, body.motion, np.array([np.cos(angle), np.sin(angle), 0.0]))
+        direction = np.array([np.cos(angle), np.sin(angle), 0.0])
+        rig = _rig(body.bones, body.motion, direction)
     binding = bind(vertices, faces, rig, body.placed)
-    rig = Rig(
-        tuple(replace(rod, points=body.warp(rod.points)) for rod in rig.rods), rig.rod_of_solid
-    )
+    warped = [replace(rod, points=body.warp(rod.points)) for rod in rig.rods]
+    rig = Rig(tuple(warped), rig.rod_of_solid)
     gaps = Gaps.of(rig)
     vigour = float(rng.uniform(0.25, 1.0))
     n_wanted = _N_CLOSE_DRAWS if rng.uniform() < _CLOSE_SHARE else 1
@@ -162,7 +160,8 @@ def draw_pose(body: Body, rng: np.random.Generator, target: int) -> Pose:
     for attempt in range(_MAX_POSES):
         # After ten attempts, rods bend less and less.
         share = vigour * (1.0 - 0.9 * max(attempt - 10, 0) / (_MAX_POSES - 10))
-        motions = rod_motions(rig, draw_turns(rig, rng, share, planar=body.motion == "sheet"))
+        turns = draw_turns(rig, rng, share, planar=body.motion == "sheet")
+        motions = rod_motions(rig, turns)
         gap = gaps.smallest(rig, motions)
         if gap < 0.0:
             continue
@@ -184,23 +183,23 @@ def _draw_candidate(
 ) -> Body:
     skeleton, motion = body_class.draw(kin)
     groups = sorted({part.group for part in skeleton.root.walk()})
-    thickness = rng.uniform(-0.1, 0.22)
+    common = rng.uniform(-0.1, 0.22)  # of the thickness of all groups
     changes = rng.uniform(-1.0, 1.0, (len(groups), 2)) * (0.16, 0.24)
-    proportions = {
-        group: (float(np.exp(spread * (thickness + thick))), float(np.exp(spread * length)))
-        for group, (thick, length) in zip(groups, changes, strict=True)
-    }
+    proportions = {}
+    for group, (thickness, length) in zip(groups, changes, strict=True):
+        thick = float(np.exp(spread * (common + thickness)))
+        long = float(np.exp(spread * length))
+        proportions[group] = (thick, long)
     bones = bones_at_rest(skeleton, proportions)
     rig = _rig(bones, motion, np.array([1.0, 0.0, 0.0]))
     corners = np.concatenate([np.stack(bone.placed.bounds()) for bone in bones])
     # A sheet must stay nearly flat, because only a flat sheet rolls without stretching.
-    warp = Warp.draw(rng, longest_side(corners), 0.05 if motion == "sheet" else 0.14 * spread)
+    strength = 0.05 if motion == "sheet" else 0.14 * spread
+    warp = Warp.draw(rng, longest_side(corners), strength)
     thinnest = min(float(rod.radii.min()) for rod in rig.rods)
-    relief = (
-        0.14 * spread * thinnest * rng.uniform(),
-        rng.uniform(0.25, 0.6),
-        int(rng.integers(2**31)),
-    )
+    amplitude = 0.14 * spread * thinnest * rng.uniform()
+    wavelength = rng.uniform(0.25, 0.6)
+    relief = (amplitude, wavelength, int(rng.integers(2**31)))
     return Body(bones, rig, skeleton.genus, motion, warp, relief)
 
 
@@ -236,7 +235,3 @@ def _rig(bones: Sequence[Bone], motion: Motion, direction: Floats) -> Rig:
 
 def _random_rotation(rng: np.random.Generator) -> Floats:
     return np.asarray(Rotation.from_quat(rng.normal(size=4)).as_matrix())
-
-
-def _product(a: Floats, b: Floats) -> Floats:
-    return (a[:, :, None] * b[None]).sum(axis=1)

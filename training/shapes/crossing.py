@@ -13,29 +13,24 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Integers:
     that lie in one plane, are not reported.
     """
     corners = vertices[faces]
-    low = corners.min(axis=1)
-    high = corners.max(axis=1)
-    i, j = _candidates(corners).T
+    pairs = _candidates(corners)
     # Each test leaves fewer pairs for the next, more expensive one.
     for axis in range(3):
-        starts_before = low[i, axis] <= high[j, axis]
-        ends_behind = low[j, axis] <= high[i, axis]
-        overlaps = starts_before & ends_behind
-        i = i[overlaps]
-        j = j[overlaps]
-    is_common = faces[i][:, :, None] == faces[j][:, None]
-    apart = ~is_common.any(axis=(1, 2))
-    i = i[apart]
-    j = j[apart]
-    a = corners[i]
-    b = corners[j]
-    crossed = np.zeros(len(i), dtype=bool)
-    for first, second in ((a, b), (b, a)):
+        low = corners[:, :, axis].min(axis=1)[pairs]
+        high = corners[:, :, axis].max(axis=1)[pairs]
+        overlaps = low.max(axis=1) <= high.min(axis=1)
+        pairs = pairs[overlaps]
+    is_common = faces[pairs[:, 0], :, None] == faces[pairs[:, 1], None]
+    pairs = pairs[~is_common.any(axis=(1, 2))]
+    one = corners[pairs[:, 0]]
+    other = corners[pairs[:, 1]]
+    is_crossed = np.zeros(len(pairs), dtype=bool)
+    for triangle, crossing in ((one, other), (other, one)):
         for k in range(3):
-            start = first[:, k]
-            end = first[:, (k + 1) % 3]
-            crossed |= _passes(start, end, second)
-    return np.stack([i[crossed], j[crossed]], axis=1)
+            start = crossing[:, k]
+            end = crossing[:, (k + 1) % 3]
+            is_crossed |= _passes(start, end, triangle)
+    return pairs[is_crossed]
 
 
 def _candidates(corners: Floats) -> Integers:
@@ -54,20 +49,16 @@ def _candidates(corners: Floats) -> Integers:
         # The few large faces are searched one by one, so that they do not enlarge the search radius of all faces.
         reach = radii[large] + radii.max()
         neighbours = cKDTree(centres).query_ball_point(centres[large], reach)
-        others = np.concatenate([np.asarray(row, dtype=np.int64) for row in neighbours])
-        own = np.repeat(large, [len(row) for row in neighbours])
-        is_small = radii[others] <= max_small
-        is_first = own < others
-        pairs = np.stack([own, others], axis=1)
-        candidates.append(pairs[is_small | is_first])
+        for face, others in zip(large, map(np.array, neighbours), strict=True):
+            is_small = radii[others] <= max_small
+            partners = others[is_small | (others > face)]
+            candidates.append(np.stack([np.full_like(partners, face), partners], axis=1))
     return np.sort(np.concatenate(candidates), axis=1)
 
 
 def _passes(start: Floats, end: Floats, triangle: Floats) -> Booleans:
     """Whether segments (N,3) to (N,3) pass through triangles (N,3,3), by the signed volumes of five tetrahedra."""
-    a = triangle[:, 0]
-    b = triangle[:, 1]
-    c = triangle[:, 2]
+    a, b, c = np.moveaxis(triangle, 1, 0)
     normal = np.cross(b - a, c - a)
     above = ((start - a) * normal).sum(axis=1)
     below = ((end - a) * normal).sum(axis=1)
@@ -76,10 +67,8 @@ def _passes(start: Floats, end: Floats, triangle: Floats) -> Booleans:
     def side(p: Floats, q: Floats) -> Floats:
         return (np.cross(p - start, q - start) * direction).sum(axis=1)
 
-    u = side(a, b)
-    v = side(b, c)
-    w = side(c, a)
-    all_positive = (u > 0.0) & (v > 0.0) & (w > 0.0)
-    all_negative = (u < 0.0) & (v < 0.0) & (w < 0.0)
+    sides = np.stack([side(a, b), side(b, c), side(c, a)])
+    all_positive = (sides > 0.0).all(axis=0)
+    all_negative = (sides < 0.0).all(axis=0)
     is_cut = above * below < 0.0
     return is_cut & (all_positive | all_negative)

@@ -47,33 +47,44 @@ class Change:
         size = float(np.sqrt(face_areas(vertices, faces).sum()))
         low, high = np.log(_RADII)
         radii = size * np.exp(rng.uniform(low, high, _N_REGIONS))
-        centres = np.empty((_N_REGIONS, 3))
-        axes = np.empty((_N_REGIONS, 3))
-        for i, seed_vertex in enumerate(rng.integers(len(vertices), size=_N_REGIONS)):
-            away = np.linalg.norm(vertices - vertices[seed_vertex], axis=1)
-            region = vertices[away < radii[i]]
-            centres[i] = region.mean(axis=0)
-            _, _, principal = np.linalg.svd(region - centres[i], full_matrices=False)
+        seeds = vertices[rng.integers(len(vertices), size=_N_REGIONS)]
+        middle = vertices.mean(axis=0)
+        centres = []
+        axes = []
+        for seed, radius in zip(seeds, radii, strict=True):
+            away = np.linalg.norm(vertices - seed, axis=1)
+            region = vertices[away < radius]
+            centre = region.mean(axis=0)
+            _, _, principal = np.linalg.svd(region - centre, full_matrices=False)
             axis = principal[0]
-            outward = centres[i] - vertices.mean(axis=0)
-            axes[i] = axis * np.where(axis @ outward < 0.0, -1.0, 1.0)
+            is_inward = axis @ (centre - middle) < 0.0
+            centres.append(centre)
+            axes.append(-axis if is_inward else axis)
         swells, grows = rng.normal(size=(2, _N_REGIONS)) * rng.uniform(0.2, 1.0, (2, 1))
-        waves = Warp.draw(rng, 2.0 * size, 0.5 * rng.uniform(0.2, 1.0))
-        change = cls(waves, centres, axes, radii, swells, grows, np.zeros(7), 1.0)
-        basis = _similarity_basis(vertices)
+        change = cls(
+            waves=Warp.draw(rng, 2.0 * size, 0.5 * rng.uniform(0.2, 1.0)),
+            centres=np.array(centres),
+            axes=np.array(axes),
+            radii=radii,
+            swells=swells,
+            grows=grows,
+            similarity=np.zeros(7),
+            step=1.0,
+        )
+        basis = _similarity_basis(vertices).reshape(-1, 7)
         steps = change(vertices) - vertices
-        fit = np.linalg.lstsq(basis.reshape(-1, 7), steps.reshape(-1), rcond=None)
-        change = replace(change, similarity=fit[0].astype(np.float64))
+        similarity, *_ = np.linalg.lstsq(basis, steps.reshape(-1), rcond=None)
+        change = replace(change, similarity=similarity.astype(np.float64))
         steps = change(vertices) - vertices
         largest = float(np.linalg.norm(steps, axis=1).max())
-        share = float(np.exp(rng.uniform(*np.log(shares))))
+        low, high = np.log(shares)
+        share = float(np.exp(rng.uniform(low, high)))
         return replace(change, step=size * share / largest)
 
     def __call__(self, points: Floats) -> Floats:
         steps = self.waves(points) - points
-        for centre, axis, radius, swell, grow in zip(
-            self.centres, self.axes, self.radii, self.swells, self.grows, strict=True
-        ):
+        regions = (self.centres, self.axes, self.radii, self.swells, self.grows)
+        for centre, axis, radius, swell, grow in zip(*regions, strict=True):
             positions = points - centre
             along = positions @ axis
             across = positions - along[:, None] * axis

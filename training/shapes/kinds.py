@@ -86,28 +86,25 @@ def body_classes(seed: int, look_alikes: bool = True) -> list[BodyClass]:
             continue
         groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
         for structure in kind.structures:
-            groups.setdefault(
-                tuple(c for i, c in enumerate(structure) if i != kind.loose), []
-            ).append(structure)
-        order = np.random.default_rng([seed, number]).permutation(len(groups))
+            fixed = tuple(choice for i, choice in enumerate(structure) if i != kind.loose)
+            groups.setdefault(fixed, []).append(structure)
         keys = list(groups)
+        order = np.random.default_rng([seed, number]).permutation(len(keys))
         queues.append([(name, kind, keys[i], groups[keys[i]]) for i in order])
     for turn in itertools.zip_longest(*queues):
-        for name, kind, key, structures in filter(None, turn):
-            words = [
-                str(word)
-                for choice in key
-                for word in (choice if isinstance(choice, tuple) else (choice,))
-            ]
-            classes.append(
-                BodyClass("-".join([name, *words, f"{len(classes):03d}"]), kind, structures)
-            )
+        for name, kind, fixed, structures in filter(None, turn):
+            words = [name]
+            for choice in fixed:
+                words += map(str, choice) if isinstance(choice, tuple) else [str(choice)]
+            words.append(f"{len(classes):03d}")
+            classes.append(BodyClass("-".join(words), kind, structures))
     return classes
 
 
 def _template(name: str) -> Kind:
     motions: dict[str, Motion] = {"plier": "hinges", "mug": "rigid", "chair": "rigid"}
-    return Kind(lambda _: TEMPLATES[name](), [()], None, lambda _: motions.get(name, "limbs"))
+    motion = motions.get(name, "limbs")
+    return Kind(lambda _: TEMPLATES[name](), [()], None, lambda _: motion)
 
 
 def _kind(

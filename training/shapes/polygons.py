@@ -20,11 +20,8 @@ class Prism(Solid):
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         inner = self.radius - self.rounding / np.cos(np.pi / self.sides)
         across, past_corner = _to_polygon(self.sides, inner, x, y)
-        a = np.where(across > 0.0, np.hypot(across, past_corner), across)
-        b = np.abs(z) - (0.5 * self.height - self.rounding)
-        outside = np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0))
-        inside = np.minimum(np.maximum(a, b), 0.0)
-        return outside + inside - self.rounding
+        flat = np.where(across > 0.0, np.hypot(across, past_corner), across)
+        return rounded(flat, z, self.height, self.rounding)
 
     def box(self) -> tuple[Floats, Floats]:
         upper = np.array([self.radius, self.radius, 0.5 * self.height])
@@ -62,6 +59,21 @@ class Frame(Solid):
 
     def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)
+
+
+def rounded(flat: Floats, z: Floats, height: float, rounding: float) -> Floats:
+    """Return signed distances from a prism about z = 0 with rounded edges.
+
+    Args:
+        flat: signed distances from its outline in the x-y plane, smaller all around by `rounding`.
+        z: coordinates.
+        height: its height.
+        rounding: radius of its edges.
+    """
+    upright = np.abs(z) - (0.5 * height - rounding)
+    outside = np.hypot(np.maximum(flat, 0.0), np.maximum(upright, 0.0))
+    inside = np.minimum(np.maximum(flat, upright), 0.0)
+    return outside + inside - rounding
 
 
 def _to_polygon(sides: int, radius: float, x: Floats, y: Floats) -> tuple[Floats, Floats]:

@@ -20,27 +20,34 @@ def draw_turns(
     """
     turns = []
     for rod in rig.rods:
-        turn = np.zeros((len(rod.arc_lengths), 3))
         # Every rod draws all of these numbers, whether they are used or not.
         shares = vigour * rng.uniform(0.0, 1.0, (len(rod.joints), 2)) ** 0.75
         waves = rng.uniform(-1.0, 1.0, (2, 3))
         waves /= np.abs(waves).max(axis=1, keepdims=True)
         twist = vigour * rod.twist * rng.uniform(-1.0, 1.0)
         signs = rng.choice([-1.0, 1.0], (len(rod.joints), 2))
+        turn = np.zeros((len(rod.arc_lengths), 3))
         for joint, share, sign in zip(rod.joints, shares, signs, strict=True):
-            limit = np.where(sign > 0.0, joint.high, -joint.low)
-            # A joint that is nearly blocked in the drawn direction, such as a knee, bends in the other one.
-            largest = np.maximum(joint.high, -joint.low)
-            direction = np.where(limit < 0.3 * largest, -1.0, 1.0) * sign
-            limit = np.where(direction > 0.0, joint.high, -joint.low)
-            angles = direction * share * limit
-            vector = (joint.axes * angles).sum(axis=1)
-            turn += _bent(rod, joint, vector)
+            turn += _bent(rod, joint, _joint_turn(joint, share, sign))
         if len(rod.arc_lengths) > 1:
             curled = _curled(rod, vigour * waves, planar)
             turn += curled + _twisted(rod, twist)
         turns.append(turn)
     return turns
+
+
+def _joint_turn(joint: Joint, share: Floats, sign: Floats) -> Floats:
+    """Rotation vector (3,) of a joint by shares (2,) of its limits, in the directions (2,) of both axes.
+
+    If it is nearly blocked in a direction, as a knee is, it bends in the other one.
+    """
+    limit = np.where(sign > 0.0, joint.high, -joint.low)
+    largest = np.maximum(joint.high, -joint.low)
+    is_blocked = limit < 0.3 * largest
+    direction = np.where(is_blocked, -sign, sign)
+    limit = np.where(direction > 0.0, joint.high, -joint.low)
+    angles = direction * share * limit
+    return (joint.axes * angles).sum(axis=1)
 
 
 def _bent(rod: Rod, joint: Joint, vector: Floats) -> Floats:
@@ -70,9 +77,9 @@ def _bent(rod: Rod, joint: Joint, vector: Floats) -> Floats:
     bump[0] = 0.0
     if bump.sum() == 0.0:
         return turns
-    share = bump / bump.sum()
     max_share = MAX_CURVATURE * step / rod.bending_radii / angle
-    return np.minimum(share, max_share)[:, None] * vector
+    share = np.minimum(bump / bump.sum(), max_share)
+    return share[:, None] * vector
 
 
 def _curled(rod: Rod, waves: Floats, planar: bool) -> Floats:
@@ -85,7 +92,8 @@ def _curled(rod: Rod, waves: Floats, planar: bool) -> Floats:
     whole_wave = 0.6 * np.cos(2.0 * np.pi * t)
     shapes = np.stack([even, half_wave, whole_wave])
     strengths = np.array([1.0, 0.0 if planar else 0.6])
-    curvature = (waves[:, :, None] * shapes[None]).sum(axis=1) * strengths[:, None]
+    mixed = (waves[:, :, None] * shapes[None]).sum(axis=1)
+    curvature = mixed * strengths[:, None]
     step = rod.arc_lengths[1]
     max_angle = MAX_CURVATURE * step / rod.bending_radii
     angles = curvature * rod.curl / len(t)

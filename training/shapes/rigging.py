@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
+from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -87,8 +88,8 @@ def bones_at_rest(skeleton: Skeleton, proportions: dict[str, tuple[float, float]
         number = len(bones) - 1
         for child in part.children:
             local = factors * np.array(child.at)
-            at = origin + (frame * local).sum(axis=1)
-            place(child, number, frame @ child.turn, at)
+            joint = origin + (frame * local).sum(axis=1)
+            place(child, number, frame @ child.turn, joint)
 
     place(skeleton.root, -1, turned("z", 0.0), np.zeros(3))
     return bones
@@ -101,14 +102,14 @@ def limb_rig(bones: Sequence[Bone], hinged: bool = False) -> Rig:
         bones: bones at rest.
         hinged: whether joints are hinges, as those of tools, and nothing else bends.
     """
-    successors = _successors(bones)
+    successors = [None] * len(bones) if hinged else _successors(bones)
     rod_of_bone = np.full(len(bones), -1)
     rods: list[Rod] = []
     for number, bone in enumerate(bones):
         if rod_of_bone[number] >= 0:
             continue
         chain = [number]
-        successor = None if hinged else successors[number]
+        successor = successors[number]
         while successor is not None:
             chain.append(successor)
             successor = successors[successor]
@@ -159,12 +160,19 @@ def strip_rig(
     half = 0.5 * float((np.abs(direction) * extent).sum())
     arc_lengths = np.linspace(0.0, 2.0 * half, MAX_ELEMENTS)
     along = arc_lengths - half
-    points = centre + along[:, None] * direction
     across = np.cross(direction, axis)
     frame = np.stack([axis, across], axis=1)
-    sides = np.tile(frame, (len(arc_lengths), 1, 1))
-    radii = np.full(len(arc_lengths), 0.5 * thickness)
-    rod = Rod(-1, 0.0, points, arc_lengths, radii, radii, sides, curl=curl)
+    radii = np.full(MAX_ELEMENTS, 0.5 * thickness)
+    rod = Rod(
+        parent=-1,
+        attachment=0.0,
+        points=centre + along[:, None] * direction,
+        arc_lengths=arc_lengths,
+        radii=radii,
+        bending_radii=radii,
+        sides=np.tile(frame, (MAX_ELEMENTS, 1, 1)),
+        curl=curl,
+    )
     return Rig((rod,), np.zeros(len(bones), dtype=np.int64))
 
 
@@ -174,55 +182,72 @@ def _successors(bones: Sequence[Bone]) -> list[int | None]:
     for number, bone in enumerate(bones):
         ahead = np.asarray(bone.tip) - bone.origin
         length = max(float(np.linalg.norm(ahead)), 1e-9)
-        candidates: list[tuple[float, float, int]] = []  # cosine with this bone, length, index
+        candidates = []
         for other, child in enumerate(bones):
             if child.parent != number or not any(child.part.bend):
                 continue
-            reach = np.asarray(child.tip) - child.origin
-            reach_length = float(np.linalg.norm(reach))
             offset = child.origin - bone.origin
             beyond = float((offset * ahead).sum()) / length**2
             aside = float(np.linalg.norm(np.cross(offset, ahead))) / length
-            cosine = float((reach * ahead).sum()) / (length * max(reach_length, 1e-9))
-            if beyond > 0.85 and aside < 0.05 * length:
-                candidates.append((cosine, reach_length, other))
+            if beyond <= 0.85 or aside >= 0.05 * length:
+                continue
+            reach = np.asarray(child.tip) - child.origin
+            child_length = float(np.linalg.norm(reach))
+            cosine = float((reach * ahead).sum()) / (length * max(child_length, 1e-9))
+            candidates.append(_Successor(other, cosine, child_length))
         if len(candidates) > 1:
-            straight = [candidate for candidate in candidates if candidate[0] > 0.9]
-            candidates = sorted(straight, key=itemgetter(1))
+            candidates = [one for one in candidates if one.cosine > 0.9]
+            candidates.sort(key=attrgetter("length"))
         successor = None
-        if candidates and candidates[-1][0] > -0.3:
-            successor = candidates[-1][2]
+        if candidates and candidates[-1].cosine > -0.3:
+            successor = candidates[-1].number
         successors.append(successor)
     return successors
+
+
+class _Successor(NamedTuple):
+    """A bone that may continue another."""
+
+    number: int
+    cosine: float  # between both
+    length: float
 
 
 def _rod(
     chain: Sequence[Bone], bones: Sequence[Bone], parent: int, attachment: float, hinged: bool
 ) -> Rod:
     """The rod of a chain of bones, with a single element if no bone can bend."""
-    line, radii, frames, starts = _centre_line(chain, parent < 0)
+    line = _centre_line(chain, parent < 0)
+    sides = line.frames[:, :, :2]
     can_bend = parent < 0 or any(any(bone.part.bend) for bone in chain)
-    if len(line) == 1 or not can_bend:
-        sides = frames[:1, :, :2]
-        return Rod(parent, attachment, line[:1], np.zeros(1), radii[:1], radii[:1], sides)
-    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    if len(line.points) == 1 or not can_bend:
+        radii = line.radii[:1]
+        return Rod(parent, attachment, line.points[:1], np.zeros(1), radii, radii, sides[:1])
+    steps = np.linalg.norm(np.diff(line.points, axis=0), axis=1)
     line_lengths = np.concatenate([[0.0], np.cumsum(steps)])
     length = float(line_lengths[-1])
-    radius = float(radii.mean())
+    radius = float(line.radii.mean())
     n_wanted = np.ceil(length / (0.3 * radius))
     n = int(np.clip(n_wanted, 8, MAX_ELEMENTS))
     arc_lengths = np.linspace(0.0, length, n)
-    columns = [np.interp(arc_lengths, line_lengths, column) for column in line.T]
-    points = np.stack(columns, axis=1)
+    columns = [np.interp(arc_lengths, line_lengths, column) for column in line.points.T]
     following = np.searchsorted(line_lengths, arc_lengths, side="right")
-    segment = np.clip(following - 1, 0, len(frames) - 1)
-    sides = frames[segment][:, :, :2]
-    radii = np.interp(arc_lengths, line_lengths, radii)
-    rod = Rod(parent, attachment, points, arc_lengths, radii, radii, sides, is_hinge=hinged)
+    segment = np.clip(following - 1, 0, len(sides) - 1)
+    radii = np.interp(arc_lengths, line_lengths, line.radii)
+    rod = Rod(
+        parent,
+        attachment,
+        np.stack(columns, axis=1),
+        arc_lengths,
+        radii,
+        bending_radii=radii,
+        sides=sides[segment],
+        is_hinge=hinged,
+    )
     spring = chain[0].solid
     if isinstance(spring, Helix):
         return replace(rod, curl=_OPENING_PER_TURN * spring.turns)
-    bone_starts = [float(line_lengths[start]) for start in starts]
+    bone_starts = [float(line_lengths[start]) for start in line.starts]
     rod = replace(rod, joints=_joints(chain, bone_starts, rod, bones))
     if hinged:
         return rod
@@ -242,28 +267,34 @@ def _joints(
     radius = float(rod.radii.mean())
     for bone, previous, start in zip(chain, (None, *chain), starts, strict=False):
         axes = bone.frame[:, :2]
-        if previous is None and rod.parent < 0:
+        is_first = previous is None
+        if is_first and rod.parent < 0:
             # The root bone is the spine, whose joint is in its middle.
             if rod.length > 2.0 * radius and not rod.is_hinge:
-                spine = np.radians([_SPINE_LIMIT, _SPINE_LIMIT])
+                limits = np.radians([_SPINE_LIMIT, _SPINE_LIMIT])
                 spine_length = float(np.linalg.norm(bone.tip - bone.origin))
                 middle = 0.5 * min(rod.length, spine_length)
-                joints.append(Joint(middle, axes, -spine, spine, False))
+                joints.append(Joint(middle, axes, -limits, limits, is_root=False))
         elif any(bone.part.bend):
             low, high = _limits(bone, previous, rod.is_hinge)
             position = start
-            if previous is None and not rod.is_hinge:
+            if is_first and not rod.is_hinge:
                 # A limb bends where it leaves the body that carries it.
-                gaps = bones[bone.parent].placed.distance(*rod.points.T)
-                outside = gaps > -0.2 * radius
-                first = int(np.argmax(outside))
-                position = float(rod.arc_lengths[first]) if outside.any() else 0.0
-            joints.append(Joint(position, axes, low, high, previous is None))
+                carrier = bones[bone.parent].placed
+                is_outside = carrier.distance(*rod.points.T) > -0.2 * radius
+                first = int(np.argmax(is_outside))
+                position = float(rod.arc_lengths[first]) if is_outside.any() else 0.0
+            joints.append(Joint(position, axes, low, high, is_root=is_first))
     return tuple(joints)
 
 
-_Line = tuple[Floats, Floats, Floats, list[int]]
-"""Points, radii and frames along a chain of bones, and the index of the first point of each bone."""
+class _Line(NamedTuple):
+    """The centre line of a chain of bones."""
+
+    points: Floats  # (n,3)
+    radii: Floats  # (n,)
+    frames: Floats  # (n,3,3)
+    starts: Sequence[int] = (0,)  # index of the first point of each bone
 
 
 def _centre_line(chain: Sequence[Bone], is_root: bool) -> _Line:
@@ -283,7 +314,7 @@ def _line_of_wire(helix: Helix, offset: Floats) -> _Line:
     outward = surface.unit(local * np.array([1.0, 1.0, 0.0]))
     frames = np.stack([upward, outward, np.zeros_like(local)], axis=2)
     radii = np.full(len(shares), helix.tube)
-    return offset + local, radii, frames, [0]
+    return _Line(offset + local, radii, frames)
 
 
 def _line_of_trunk(root: Bone) -> _Line:
@@ -295,14 +326,14 @@ def _line_of_trunk(root: Bone) -> _Line:
     across = np.delete(np.arange(3), longest)
     if side[longest] < 1.6 * side[across].max():
         radius = 0.5 * side.mean()
-        return centre[None], np.array([radius]), root.frame[None], [0]
+        return _Line(centre[None], np.array([radius]), root.frame[None])
     axis = root.frame[:, longest]
     reach = 0.42 * side[longest] * axis
-    line = np.stack([centre - reach, centre + reach])
+    ends = np.stack([centre - reach, centre + reach])
     first, second = root.frame[:, across].T
     frame = np.stack([first, second, axis], axis=1)
     radius = 0.25 * side[across].sum()
-    return line, np.full(2, radius), np.tile(frame, (2, 1, 1)), [0]
+    return _Line(ends, np.full(2, radius), np.tile(frame, (2, 1, 1)))
 
 
 def _line_of_limb(chain: Sequence[Bone]) -> _Line:
@@ -331,18 +362,18 @@ def _line_of_limb(chain: Sequence[Bone]) -> _Line:
     points.append(last.tip)
     radii.append(last.solid.end if isinstance(last.solid, Cone | Arc) else last.radius)
     frames.append(last.frame)
-    return np.array(points), np.array(radii), np.array(frames), starts
+    return _Line(np.array(points), np.array(radii), np.array(frames), starts)
 
 
 def _limits(bone: Bone, previous: Bone | None, hinged: bool) -> tuple[Floats, Floats]:
     """Limits of raise and swing, radians. A knee that is bent at rest bends further to the same side."""
-    factor = _INNER_FACTOR
-    limit = _INNER_LIMIT
-    if previous is None:
-        factor = _ROOT_FACTOR
-        limit = _ROOT_LIMIT
     bend = np.array(bone.part.bend[:2], dtype=float)
-    degrees = 1.4 * bend if hinged else np.minimum(factor * bend, limit)
+    if hinged:
+        degrees = 1.4 * bend
+    elif previous is None:
+        degrees = np.minimum(_ROOT_FACTOR * bend, _ROOT_LIMIT)
+    else:
+        degrees = np.minimum(_INNER_FACTOR * bend, _INNER_LIMIT)
     high = np.radians(degrees)
     low = -high
     if previous is None:

@@ -64,9 +64,8 @@ class Rod:
     points: Floats  # (n,3) of the centre line
     arc_lengths: Floats  # (n,)
     radii: Floats  # (n,)
-    bending_radii: (
-        Floats  # (n,) radii that limit bending: larger where a rigid solid sits on the rod
-    )
+    # (n,) radii that limit bending: larger where a rigid solid sits on the rod
+    bending_radii: Floats
     sides: Floats  # (n,3,2) two directions across the rod
     joints: tuple[Joint, ...] = ()
     curl: float = 0.0  # largest curl over the whole length, radians
@@ -103,14 +102,11 @@ def rod_motions(rig: Rig, turns: Sequence[Floats]) -> list[Motions]:
             carrier = rig.rods[rod.parent]
             carried = motions_of_rods[rod.parent]
             motion = _interpolated(carrier, carried, np.array(rod.attachment))
-        steps = rotations_about(rod.points, turn)
-        real = np.empty((len(turn), 4))
-        dual = np.empty((len(turn), 4))
-        for j in range(len(turn)):
-            step = Motions(steps.real[j], steps.dual[j])
-            motion = compose(motion, step)
-            real[j] = motion.real
-            dual[j] = motion.dual
+        motions = []
+        for step in zip(*rotations_about(rod.points, turn), strict=True):
+            motion = compose(motion, Motions(*step))
+            motions.append(motion)
+        real, dual = map(np.array, zip(*motions, strict=True))
         motions_of_rods.append(normalized(Motions(real, dual)))
     return motions_of_rods
 
@@ -219,8 +215,10 @@ def _interpolated(rod: Rod, motions: Motions, arc_lengths: Floats) -> Motions:
     position = np.clip(position, 0.0, n_elements - 1.0)
     lower = np.minimum(position.astype(np.int64), n_elements - 2)
     share = (position - lower)[..., None]
-    blend = [(1.0 - share) * part[lower] + share * part[lower + 1] for part in motions]
-    return normalized(Motions(*blend))
+    blended = []
+    for part in motions:
+        blended.append((1.0 - share) * part[lower] + share * part[lower + 1])
+    return normalized(Motions(*blended))
 
 
 def _diffused(vertices: Floats, faces: Integers, values: Floats, width: Floats) -> Floats:
@@ -238,13 +236,17 @@ def _diffused(vertices: Floats, faces: Integers, values: Floats, width: Floats) 
     i = np.roll(faces, -1, axis=1).ravel()
     j = np.roll(faces, -2, axis=1).ravel()
     n = len(vertices)
-    off_diagonal = coo_array((conductance.ravel(), (i, j)), shape=(n, n)).tocsc()
-    off_diagonal = off_diagonal + off_diagonal.T
-    mass = surface.vertex_areas(vertices, faces)
+    one_way = coo_array((conductance.ravel(), (i, j)), shape=(n, n)).tocsc()
+    off_diagonal = one_way + one_way.T
     sums = np.asarray(off_diagonal.sum(axis=1)).ravel()
-    matrix = (diags_array(mass + sums) - off_diagonal).tocsc()
-    symmetric = {"SymmetricMode": True}
-    solver = splu(matrix, permc_spec="MMD_AT_PLUS_A", options=symmetric, diag_pivot_thresh=0.0)
+    mass = surface.vertex_areas(vertices, faces)
+    diagonal = diags_array(mass + sums)
+    solver = splu(
+        (diagonal - off_diagonal).tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
     for _ in range(2):
         values = solver.solve(mass[:, None] * values)
     return values

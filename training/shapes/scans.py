@@ -74,9 +74,8 @@ class Scan:
             edge = np.sqrt(mesh.area / len(mesh.faces))
             steps = self.noise * edge * rng.normal(size=(len(mesh.vertices), 1))
             vertices = mesh.vertices + steps * surface.vertex_normals(mesh.vertices, mesh.faces)
-            mesh = Mesh(
-                vertices, mesh.faces, mesh.name, notes=(*mesh.notes, "noise along the normals")
-            )
+            notes = (*mesh.notes, "noise along the normals")
+            mesh = Mesh(vertices, mesh.faces, mesh.name, notes=notes)
         if self.is_watertight:
             # Limbs that nearly touch may merge on a coarse grid. In this case the surface is left unchanged.
             closed = watertight(
@@ -87,13 +86,14 @@ class Scan:
                 name=mesh.name,
             )
             if closed.genus == genus:
-                mesh = Mesh(
-                    closed.vertices, closed.faces, mesh.name, notes=(*mesh.notes, *closed.notes)
-                )
+                notes = (*mesh.notes, *closed.notes)
+                mesh = Mesh(closed.vertices, closed.faces, mesh.name, notes=notes)
         if mesh.genus != genus:
             raise MeshError(f"{mesh.name}: expected genus {genus}, got {mesh.genus}.")
         centred = mesh.vertices - mesh.vertices.mean(axis=0)
         turned = (centred[:, None] * self.motion[None]).sum(axis=2)
-        faces = mesh.faces[:, ::-1] if self.is_mirrored else mesh.faces
-        notes = (*mesh.notes, "mirrored") if self.is_mirrored else mesh.notes
-        return Mesh(self.scale * (turned + self.offset), faces, mesh.name, notes=notes)
+        vertices = self.scale * (turned + self.offset)
+        if not self.is_mirrored:
+            return Mesh(vertices, mesh.faces, mesh.name, notes=mesh.notes)
+        notes = (*mesh.notes, "mirrored")
+        return Mesh(vertices, mesh.faces[:, ::-1], mesh.name, notes=notes)

@@ -42,20 +42,28 @@ class Helix(Solid):
             dx = x - self.radius * np.cos(angle)
             dy = y - self.radius * np.sin(angle)
             dz = z - turn * self.pitch
-            squared = np.minimum(squared, dx**2 + dy**2 + dz**2)
+            to_turn = dx**2 + dy**2 + dz**2
+            squared = np.minimum(squared, to_turn)
         for end in (0.0, 1.0):
-            cx, cy, cz = self.at(end)
-            squared = np.minimum(squared, (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
+            end_x, end_y, end_z = self.at(end)
+            to_end = (x - end_x) ** 2 + (y - end_y) ** 2 + (z - end_z) ** 2
+            squared = np.minimum(squared, to_end)
         return np.sqrt(squared) - self.tube
 
     def box(self) -> tuple[Floats, Floats]:
         wide = self.radius + self.tube
         high = self.pitch * self.turns + self.tube
-        return np.array([-wide, -wide, -self.tube]), np.array([wide, wide, high])
+        lower = np.array([-wide, -wide, -self.tube])
+        upper = np.array([wide, wide, high])
+        return lower, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
-        tube = min(self.tube * thick, 0.4 * self.pitch)
-        return Helix(self.radius * length, self.pitch * length, self.turns, tube)
+        return Helix(
+            radius=self.radius * length,
+            pitch=self.pitch * length,
+            turns=self.turns,
+            tube=min(self.tube * thick, 0.4 * self.pitch),
+        )
 
     def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)
@@ -67,8 +75,8 @@ def coil(g: np.random.Generator, turns: float, end: str) -> Skeleton:
     pitch = g.uniform(0.34, 0.46)
     tube = g.uniform(0.1, 0.125)
     solid = Helix(radius, pitch, turns, tube)
-    children: tuple[Part, ...] = ()
-    if end != "plain":
-        end_solid = {"knob": Blob((0.2, 0.2, 0.2)), "disc": Prism(16, 0.3, 0.2, 0.07)}[end]
-        children = tuple(Part(end_solid, "end", at=solid.at(share)) for share in (0.0, 1.0))
+    if end == "plain":
+        return Skeleton(Part(solid, "coil"))
+    end_solid = Blob((0.2, 0.2, 0.2)) if end == "knob" else Prism(16, 0.3, 0.2, 0.07)
+    children = tuple(Part(end_solid, "end", at=solid.at(share)) for share in (0.0, 1.0))
     return Skeleton(Part(solid, "coil", children=children))

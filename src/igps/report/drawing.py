@@ -50,23 +50,27 @@ def paint(
     from matplotlib.tri import Triangulation
 
     own = unit(area_vectors(vertices, faces))
-    front = np.nonzero(own[:, 2] > 0)[0]
+    front = np.flatnonzero(own[:, 2] > 0)
     depths = vertices[faces[front], 2].mean(axis=1)
     front = front[np.argsort(depths)]  # the painter's algorithm: far faces first
     shown = faces[front]
+    own = own[front]
     normals = vertex_normals(vertices, faces)[shown]
-    cosines = np.einsum("fkc,fc->fk", normals, own[front])
+    cosines = np.einsum("fkc,fc->fk", normals, own)
     is_crease = cosines < _MIN_SMOOTH
-    normals = np.where(is_crease[..., None], own[front][:, None], normals)
+    normals = np.where(is_crease[..., None], own[:, None], normals)
     light = np.clip(0.35 + 0.6 * normals @ _LIGHT, 0, 1)
     unlit = np.broadcast_to(colour, vertices.shape)[shown]
+    lit = light[..., None] * unlit
     corners = vertices[shown].reshape(-1, 3)
     triangles = np.arange(len(corners)).reshape(-1, 3)
-    surface = TriMesh(Triangulation(corners[:, 0], corners[:, 1], triangles), rasterized=True)
-    surface.set_facecolor((light[..., None] * unlit).reshape(-1, 3))
+    triangulation = Triangulation(corners[:, 0], corners[:, 1], triangles)
+    surface = TriMesh(triangulation, rasterized=True)
+    surface.set_facecolor(lit.reshape(-1, 3))
     axis.add_collection(surface)
-    low = vertices[:, :2].min(axis=0)
-    high = vertices[:, :2].max(axis=0)
+    plane = vertices[:, :2]
+    low = plane.min(axis=0)
+    high = plane.max(axis=0)
     x, y = (low + high) / 2
     if reach is None:
         reach = _MARGIN / 2 * (high - low).max()
@@ -97,10 +101,12 @@ def axes_of(points: Floats) -> Floats:
     The slender end points down and the wide side to the left, so that similar bodies are drawn in the same orientation.
     """
     centred = points - points.mean(axis=0)
-    axes: Floats = np.linalg.svd(centred, full_matrices=False)[2][:2]
-    signs = np.where(((centred @ axes.T) ** 3).mean(axis=0) < 0, -1, 1)
-    up = -signs[0] * axes[0]
-    right = signs[1] * axes[1]
+    _, _, axes = np.linalg.svd(centred, full_matrices=False)
+    axes = axes[:2]
+    along = centred @ axes.T
+    has_slender_end_ahead = (along**3).mean(axis=0) >= 0
+    up = np.where(has_slender_end_ahead[0], -axes[0], axes[0])
+    right = np.where(has_slender_end_ahead[1], axes[1], -axes[1])
     return np.stack([right, up, np.cross(right, up)], axis=1)
 
 
@@ -118,18 +124,18 @@ def save_figure(figure: Figure, path: Path, dpi: float | None = None) -> None:
 
     for text in figure.findobj(Text):
         text.set_parse_math(False)  # a $ in the name of a body does not start a formula
-    with rc_context(
-        {"svg.hashsalt": "igps"}
-    ):  # otherwise, the identifiers in an SVG file are random
-        figure.savefig(
-            path, dpi=dpi or _DPI, metadata={"Date": None} if path.suffix == ".svg" else None
-        )
+    metadata = {"Date": None} if path.suffix == ".svg" else None
+    # Without it, the identifiers in an SVG file are random
+    with rc_context({"svg.hashsalt": "igps"}):
+        figure.savefig(path, dpi=dpi or _DPI, metadata=metadata)
 
 
 def shortened(name: str) -> str:
     """Return a name for a figure: the middle of a long name, which would leave no room for the plot, is left out."""
+    if len(name) <= _MAX_NAME_LENGTH:
+        return name
     half = _MAX_NAME_LENGTH // 2
-    return name if len(name) <= _MAX_NAME_LENGTH else f"{name[:half]}…{name[1 - half :]}"
+    return f"{name[:half]}…{name[1 - half :]}"
 
 
 def titles_of(names: Sequence[str]) -> list[str]:

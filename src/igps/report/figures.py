@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.cluster.hierarchy import dendrogram
@@ -38,6 +39,7 @@ from igps.retrieval import PrecisionRecallCurve
 from igps.signature.voxels import grid_axes, inside_grid, interior_samples
 
 if TYPE_CHECKING:
+    from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
 
@@ -52,11 +54,28 @@ class Painted:
     inside: Callable[[Floats], Floats] | None = None  # the values (P,) at points (P, 3) inside
 
 
+class _Slice(NamedTuple):
+    """A plane through a body."""
+
+    values: Floats  # (X, Y), NaN outside of the body
+    extent: tuple[float, ...]  # of both axes of the plane: first and last
+    title: str  # where it lies
+
+
 LEVEL = 0.05
 """Largest false discovery rate of bodies that are marked as significant."""
 _SLICE_RESOLUTION = 128  # pixels along the longest side of a body
+_N_ABREAST = 4  # outliers in a row
 _SIGNIFICANT = PALETTE[0]
 _OTHER = "#777777"
+# Curves of precision and recall beyond the first round of colours differ by line style and marker
+_STYLES = ("-", "--", ":")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
+_MAP_MARKERS = ("o", "s", "^", "x", "+", "D")
+_BLUE: Floats = np.array([0.0, 0.35, 0.7])
+_WHITE: Floats = np.array([0.9, 0.9, 0.9])
+_RED: Floats = np.array([0.84, 0.25, 0.0])
+_PALE = 0.3  # strength of the colours where values do not count
 
 
 def write_analysis(
@@ -64,8 +83,10 @@ def write_analysis(
 ) -> None:
     """Write rows as NAME.csv and NAME.json, and the figure, if any, as NAME.svg and NAME.png."""
     out.mkdir(parents=True, exist_ok=True)
-    (out / f"{name}.json").write_text(json.dumps(finite(list(rows)), indent=2) + "\n")
-    write_rows(out / f"{name}.csv", rows[0] if rows else (), (row.values() for row in rows))
+    text = json.dumps(finite(list(rows)), indent=2)
+    (out / f"{name}.json").write_text(text + "\n")
+    header = rows[0] if rows else ()
+    write_rows(out / f"{name}.csv", header, (row.values() for row in rows))
     if figure is not None:
         save_both(figure, out / name)
 
@@ -85,11 +106,17 @@ def write_movement(out: Path, names: Sequence[str], movement: Movement) -> None:
     rotations = (np.eye(3), movement.superposition.rotation)
     shifts = (np.zeros(3), movement.superposition.shift)
     for side, (name, places) in enumerate(zip(names, movement.correspondence.places, strict=True)):
+        displacements = movement.displacements[side].tolist()
         shares = movement.shares(side)
-        columns = (places.names, movement.displacements[side].tolist(), shares.tolist())
+        columns = (places.names, displacements, shares.tolist())
         for place, displacement, share in zip(*columns, strict=True):
             rows.append(
-                {"name": name, "place": place, "displacement": displacement, "share": share}
+                {
+                    "name": name,
+                    "place": place,
+                    "displacement": displacement,
+                    "share": share,
+                }
             )
         path = out / f"explain_{side + 1}{places.suffix}"
         places.save(path, 100 * shares, rotations[side], shifts[side])
@@ -98,20 +125,19 @@ def write_movement(out: Path, names: Sequence[str], movement: Movement) -> None:
 
 def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
     """Plot the effects of all tested bodies with their intervals, the largest on top; return None if there are none."""
-    tested = sorted(
-        (test for test in tests if test.effect is not None), key=lambda test: test.effect or 0
-    )
+    tested = [test for test in tests if test.effect is not None]
     if not tested:
         return None
+    tested.sort(key=lambda test: test.effect or 0)
     figure = new_figure(6.5, 1.2 + 0.24 * len(tested))
     axes = figure.add_subplot()
-    intervals = np.array(
-        [(test.effect, test.effect_low, test.effect_high) for test in tested], dtype=float
-    )
-    for y, (test, (effect, low, high)) in enumerate(zip(tested, intervals, strict=True)):
-        colour = _SIGNIFICANT if (test.permanova_q or 0) <= LEVEL else _OTHER
-        axes.plot([low, high], [y, y], color=colour, linewidth=1.6)
-        axes.plot(effect, y, "o" if colour == _SIGNIFICANT else "s", color=colour, markersize=5)
+    for y, test in enumerate(tested):
+        is_significant = (test.permanova_q or 0) <= LEVEL
+        colour = _SIGNIFICANT if is_significant else _OTHER
+        marker = "o" if is_significant else "s"
+        numbers = np.array([test.effect, test.effect_low, test.effect_high], dtype=float)
+        axes.plot(numbers[1:], [y, y], color=colour, linewidth=1.6)
+        axes.plot(numbers[0], y, marker, color=colour, markersize=5)
     axes.axvline(0, color="#BBBBBB", linewidth=0.8, zorder=0)
     axes.set_yticks(range(len(tested)), [shortened(test.body) for test in tested])
     axes.set_xlabel("share of squared distances that the groups explain, 95 % interval")
@@ -122,21 +148,24 @@ def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
 
 
 def outliers_figure(pictured: Sequence[tuple[Outlier, str, Mesh]]) -> Figure:
-    """Draw bodies with their scores, names and reasons, four in a row; those of a class from the same side."""
-    n_rows = -(-len(pictured) // 4)
+    """Draw bodies with their scores, names and reasons; those of a class from the same side."""
+    n_rows = math.ceil(len(pictured) / _N_ABREAST)
     figure = new_figure(9, 2.6 * n_rows)
-    all_axes = list(figure.subplots(n_rows, 4, squeeze=False).flat)
+    all_axes = list(figure.subplots(n_rows, _N_ABREAST, squeeze=False).flat)
     for axes in all_axes:
         axes.set_axis_off()
-    names = titles_of([name for _, name, _ in pictured])
+    titles = titles_of([name for _, name, _ in pictured])
     first_of_class: dict[str, Mesh] = {}
-    for axes, name, (outlier, _, mesh) in zip(all_axes, names, pictured, strict=False):
+    for axes, title, (outlier, _, mesh) in zip(all_axes, titles, pictured, strict=False):
         small = thumbnail(mesh)
-        like = first_of_class.setdefault(outlier.label, small)
-        views, bodies = common_views([small] if like is small else [like, small])
+        first = first_of_class.setdefault(outlier.label, small)
+        drawn = [small] if first is small else [first, small]
+        views, bodies = common_views(drawn)
         draw_view(axes, views[0], small, bodies[-1], GREY)
-        title = "\n".join(wrap(f"{outlier.score:.1f}  {name}", 38) + wrap(outlier.reason, 38))
-        axes.set_title(title, fontsize=6, color=_SIGNIFICANT if outlier.is_outlier else "#000000")
+        lines = wrap(f"{outlier.score:.1f}  {title}", 38)
+        lines += wrap(outlier.reason, 38)
+        colour = _SIGNIFICANT if outlier.is_outlier else "#000000"
+        axes.set_title("\n".join(lines), fontsize=6, color=colour)
     return figure
 
 
@@ -147,21 +176,15 @@ def painted_figure(
 
     For `superposed` see `common_views`.
     """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LinearSegmentedColormap, Normalize
-
     views, bodies = common_views([body.mesh for body in painted], superposed)
     reach = reach_of(views, bodies)
-    everything = np.abs(np.concatenate([body.values for body in painted]))
-    largest = float(np.quantile(everything, 0.98)) or float(everything.max()) or 1.0
-    lowest = min(float(body.values.min()) for body in painted)
+    everything = np.concatenate([body.values for body in painted])
+    scale = _scale_of(everything)
     figure = new_figure(12, 2.4 * len(painted) + 0.6)
     figure.set_layout_engine("constrained", rect=(0, 0, 0.93, 1))
     all_axes = figure.subplots(len(painted), len(views), squeeze=False)
-    colour_map = LinearSegmentedColormap.from_list("shares", [_BLUE, _WHITE, _RED])
-    scale = ScalarMappable(Normalize(-largest, largest), colour_map)
-    names = titles_of([body.name for body in painted])
-    for row, body, name, vertices in zip(all_axes, painted, names, bodies, strict=True):
+    titles = titles_of([body.name for body in painted])
+    for row, body, title, vertices in zip(all_axes, painted, titles, bodies, strict=True):
         colours = scale.to_rgba(body.values)[:, :3]
         if body.is_held is not None:
             pale = _WHITE + _PALE * (colours - _WHITE)
@@ -169,12 +192,30 @@ def painted_figure(
         for axes, view in zip(row, views, strict=True):
             draw_view(axes, view, body.mesh, vertices, colours, reach)
             axes.set_title(view.title, fontsize=7)
-        row[0].set_title(f"{name}\n", fontsize=7, loc="left")
-    bar = figure.colorbar(scale, cax=figure.add_axes((0.94, 0.2, 0.01, 0.6)))
-    bar.ax.set_ylim(-largest if lowest < 0 else 0, largest)
+        row[0].set_title(f"{title}\n", fontsize=7, loc="left")
+    beside = figure.add_axes((0.94, 0.2, 0.01, 0.6))
+    _add_bar(figure, scale, legend, cax=beside)
+    if everything.min() >= 0:
+        beside.set_ylim(bottom=0)
+    return figure
+
+
+def _scale_of(values: Floats) -> ScalarMappable:
+    """Return colours from blue (negative) over white (0) to red; a few extreme values share the last colour."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    sizes = np.abs(values)
+    largest = float(np.quantile(sizes, 0.98)) or float(sizes.max()) or 1.0
+    colour_map = LinearSegmentedColormap.from_list("shares", [_BLUE, _WHITE, _RED])
+    return ScalarMappable(Normalize(-largest, largest), colour_map)
+
+
+def _add_bar(figure: Figure, scale: ScalarMappable, legend: str, **place: Any) -> None:
+    """Add the bar of colours, with a legend, at a place that `Figure.colorbar` understands."""
+    bar = figure.colorbar(scale, **place)
     bar.ax.tick_params(labelsize=6)
     bar.set_label(legend, fontsize=7)
-    return figure
 
 
 def write_painted(
@@ -196,45 +237,46 @@ def write_painted(
 
 def slices_figure(painted: Sequence[Painted], legend: str) -> Figure:
     """Draw three slices of each body through the place of its largest value inside: red positive, blue negative."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    colours = LinearSegmentedColormap.from_list("shares", [_BLUE, _WHITE, _RED])
     figure = new_figure(7.5, 2.6 * len(painted))
     all_axes = figure.subplots(len(painted), 3, squeeze=False)
     slices = [_slices(body) for body in painted]
-    everything = np.concatenate([values[~np.isnan(values)] for own in slices for values, *_ in own])
-    largest = float(np.quantile(np.abs(everything), 0.98)) or 1.0
-    names = titles_of([body.name for body in painted])
-    for row, name, body, own in zip(all_axes, names, painted, slices, strict=True):
-        for axes, (values, extent, title) in zip(row, own, strict=True):
-            drawn = axes.imshow(
-                values.T, colours, vmin=-largest, vmax=largest, origin="lower", extent=extent
+    everything = np.concatenate([plane.values.ravel() for own in slices for plane in own])
+    scale = _scale_of(everything[~np.isnan(everything)])
+    titles = titles_of([body.name for body in painted])
+    for row, title, body, own in zip(all_axes, titles, painted, slices, strict=True):
+        for axes, plane in zip(row, own, strict=True):
+            axes.imshow(
+                plane.values.T,
+                scale.cmap,
+                scale.norm,
+                origin="lower",
+                extent=plane.extent,
             )
-            axes.set_title(f"{title} {body.mesh.unit or ''}", fontsize=7)
+            axes.set_title(f"{plane.title} {body.mesh.unit or ''}", fontsize=7)
             axes.set_axis_off()
-        row[0].set_title(f"{name}\n\n", fontsize=7, loc="left")
-    bar = figure.colorbar(drawn, ax=all_axes, shrink=0.6)
-    bar.ax.tick_params(labelsize=6)
-    bar.set_label(legend, fontsize=7)
+        row[0].set_title(f"{title}\n\n", fontsize=7, loc="left")
+    _add_bar(figure, scale, legend, ax=all_axes, shrink=0.6)
     return figure
 
 
-def _slices(body: Painted) -> list[tuple[Floats, tuple[float, ...], str]]:
-    """Return the values (X, Y) of three slices, NaN outside of the body, where they lie, and their places in words."""
+def _slices(body: Painted) -> list[_Slice]:
+    """Return the three slices through the place of the largest value inside a body."""
     assert body.inside is not None
     points = interior_samples(body.mesh)
     middle = points[body.inside(points).argmax()]
     slices = []
-    for i, axis in enumerate("xyz"):
-        lines = list(grid_axes(body.mesh, _SLICE_RESOLUTION))
-        lines[i] = middle[i : i + 1]
+    for axis, letter in enumerate("xyz"):
+        x, y, z = grid_axes(body.mesh, _SLICE_RESOLUTION)
+        lines = [x, y, z]
+        lines[axis] = middle[axis : axis + 1]
         is_inside = inside_grid(body.mesh, (lines[0], lines[1], lines[2]))
         grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
         values = np.full(is_inside.shape, np.nan)
         values[is_inside] = body.inside(grid[is_inside])
-        across = [line for k, line in enumerate(lines) if k != i]
-        extent = tuple(float(line[end]) for line in across for end in (0, -1))
-        slices.append((values.squeeze(i), extent, f"{axis} = {middle[i]:.4g}"))
+        extent = []
+        for across in (*lines[:axis], *lines[axis + 1 :]):
+            extent += [float(across[0]), float(across[-1])]
+        slices.append(_Slice(values.squeeze(axis), tuple(extent), f"{letter} = {middle[axis]:.4g}"))
     return slices
 
 
@@ -248,24 +290,37 @@ def map_figure(body_map: BodyMap, values: Sequence[str] | Sequence[float], title
         handles = []
         for number, name in enumerate(names):
             own = [value == name for value in values]
-            marker = _MAP_MARKERS[number // len(PALETTE) % len(_MAP_MARKERS)]
-            colour = PALETTE[number % len(PALETTE)]
+            n_rounds, place = divmod(number, len(PALETTE))
             handles.append(
                 axes.scatter(
-                    x[own], y[own], s=20, label=name, linewidths=0.8, marker=marker, color=colour
+                    x[own],
+                    y[own],
+                    s=20,
+                    label=name,
+                    linewidths=0.8,
+                    marker=_MAP_MARKERS[n_rounds % len(_MAP_MARKERS)],
+                    color=PALETTE[place],
                 )
             )
-        if any(
-            names
-        ):  # with explicit handles, because Matplotlib skips labels that begin with an underscore
-            labels = list(map(shortened, names))
-            n_columns = 1 + len(names) // 30
+        if any(names):
             figure.legend(
-                handles, labels, loc="outside right upper", title=title, fontsize=7, ncols=n_columns
+                # Given, because Matplotlib skips labels that begin with an underscore
+                handles,
+                list(map(shortened, names)),
+                loc="outside right upper",
+                title=title,
+                fontsize=7,
+                ncols=1 + len(names) // 30,
             )
     else:
-        figure.colorbar(axes.scatter(x, y, s=20, c=values, cmap="viridis"), label=title)
-    axes.set(aspect="equal", xticks=[], yticks=[], xlabel=f"stress {body_map.stress:.2f}")
+        points = axes.scatter(x, y, s=20, c=values, cmap="viridis")
+        figure.colorbar(points, label=title)
+    axes.set(
+        aspect="equal",
+        xticks=[],
+        yticks=[],
+        xlabel=f"stress {body_map.stress:.2f}",
+    )
     return figure
 
 
@@ -273,20 +328,21 @@ def clusters_figure(clustering: Clusters, names: Sequence[str]) -> Figure:
     """Plot the tree of bodies, each labelled with its cluster and the stability of the cluster in brackets."""
     figure = new_figure(7, max(2.0, 0.6 + 0.13 * len(names)))
     axes = figure.add_subplot()
-    leaves = dendrogram(
+    drawn = dendrogram(
         clustering.tree, orientation="left", ax=axes, link_color_func=lambda _: _OTHER
-    )["leaves"]
+    )
+    leaves = drawn["leaves"]
     clusters = clustering.labels[leaves]
-    names = [shortened(names[i]) for i in leaves]
-    stability = ["–" if np.isnan(value) else f"{value:.2f}" for value in clustering.stability]
-    labels = [
-        f"{name}  {cluster + 1} ({stability[cluster]})"
-        for name, cluster in zip(names, clusters, strict=True)
-    ]
+    labels = []
+    for leaf, cluster in zip(leaves, clusters, strict=True):
+        stability = clustering.stability[cluster]
+        shown = "–" if np.isnan(stability) else f"{stability:.2f}"
+        labels.append(f"{shortened(names[leaf])}  {cluster + 1} ({shown})")
     axes.set_yticks(5 + 10 * np.arange(len(leaves)), labels, fontsize=5)
     for label, cluster in zip(axes.get_yticklabels(), clusters, strict=True):
-        weight = "bold" if clustering.stability[cluster] >= STABLE else "normal"
-        label.set(color=PALETTE[cluster % len(PALETTE)], weight=weight)
+        is_stable = clustering.stability[cluster] >= STABLE
+        colour = PALETTE[cluster % len(PALETTE)]
+        label.set(color=colour, weight="bold" if is_stable else "normal")
     axes.set_xlabel(
         f"distance; after each name: cluster (stability), bold for at least {STABLE}", fontsize=7
     )
@@ -297,40 +353,27 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
     """Plot the precision of descriptors at equal levels of recall, both in percent, to a PNG file."""
     figure = new_figure(8.5, 5.2)
     axes = figure.add_subplot()
-    for i, (name, curve) in enumerate(curves.items()):
-        colour = PALETTE[i % len(PALETTE)]
-        line = _STYLES[i // len(PALETTE) % len(_STYLES)]
-        recall = 100 * curve.recall.numpy()
-        precision = 100 * curve.precision.numpy()
-        marker = _MARKERS[i % len(_MARKERS)]
+    for number, (name, curve) in enumerate(curves.items()):
+        n_rounds, place = divmod(number, len(PALETTE))
         axes.plot(
-            recall,
-            precision,
+            100 * curve.recall.numpy(),
+            100 * curve.precision.numpy(),
             label=name,
-            color=colour,
-            linestyle=line,
+            color=PALETTE[place],
+            linestyle=_STYLES[n_rounds % len(_STYLES)],
             linewidth=1.4,
-            marker=marker,
+            marker=_MARKERS[number % len(_MARKERS)],
             markersize=4,
         )
     axes.set(xlim=(0, 102), ylim=(0, 102))
     axes.set_xlabel("recall: share of the query's class that is retrieved (%)")
     axes.set_ylabel("precision: share of the query's class among the retrieved (%)")
-    n_queries = [curve.n_queries for curve in curves.values()]
-    low = min(n_queries)
-    high = max(n_queries)
-    axes.set_title(
-        f"leave-one-out, mean over {high if low == high else f'{low} to {high}'} queries"
-    )
+    n_queries = sorted({curve.n_queries for curve in curves.values()})
+    shown = f"{n_queries[0]}"
+    if len(n_queries) > 1:
+        shown = f"{n_queries[0]} to {n_queries[-1]}"
+    axes.set_title(f"leave-one-out, mean over {shown} queries")
     axes.grid(color="#DDDDDD", linewidth=0.6)
     figure.legend(loc="outside right upper", frameon=False, title="system")
     out.parent.mkdir(parents=True, exist_ok=True)
     save_figure(figure, out, dpi=130)
-
-
-# Curves of precision and recall beyond the first round of colours differ by line style and marker
-_STYLES = ("-", "--", ":")
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
-_MAP_MARKERS = ("o", "s", "^", "x", "+", "D")
-_BLUE, _WHITE, _RED = np.array([[0.0, 0.35, 0.7], [0.9, 0.9, 0.9], [0.84, 0.25, 0.0]])
-_PALE = 0.3  # strength of the colours where values do not count

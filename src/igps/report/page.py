@@ -1,11 +1,11 @@
 """The page of results: a self-contained HTML file that shows rankings, scores and bodies."""
 
-import base64
 import hashlib
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 
+from igps._text import counted
 from igps.report.page_data import N_WORST, base64_text, data_of
 from igps.report.pictures import PageSurface
 from igps.report.results import Results
@@ -17,19 +17,19 @@ N_OUTLIERS = 50
 """Largest number of outliers on the page."""
 _PLOT_WIDTH, _PLOT_HEIGHT = 600, 340  # of the axes of the precision–recall plot, in SVG units
 
-SCORE_MEANINGS = dict(  # noqa: C408
-    nn="nearest neighbour: share of queries whose nearest shape is of their class",
-    ft="first tier: share of the query's class that is among the nearest n shapes, for a class with n other members",
-    st="second tier: the same among the nearest 2n shapes",
-    e="E-measure: harmonic mean of precision and recall among the nearest 32 shapes",
-    dcg="discounted cumulative gain: shapes of the class count less the lower their rank",
-    adr="average dynamic recall",
-    adr_self="average dynamic recall with the query itself in the ranking, as in SHREC'07",
-    map="mean average precision",
-    first_5="share of queries whose other shape is among the nearest 5",
-    first_10="share of queries whose other shape is among the nearest 10",
-    median_rank="median rank of the other shape, from 1",
-)
+SCORE_MEANINGS = {
+    "nn": "nearest neighbour: share of queries whose nearest shape is of their class",
+    "ft": "first tier: share of the query's class that is among the nearest n shapes, for a class with n other members",
+    "st": "second tier: the same among the nearest 2n shapes",
+    "e": "E-measure: harmonic mean of precision and recall among the nearest 32 shapes",
+    "dcg": "discounted cumulative gain: shapes of the class count less the lower their rank",
+    "adr": "average dynamic recall",
+    "adr_self": "average dynamic recall with the query itself in the ranking, as in SHREC'07",
+    "map": "mean average precision",
+    "first_5": "share of queries whose other shape is among the nearest 5",
+    "first_10": "share of queries whose other shape is among the nearest 10",
+    "median_rank": "median rank of the other shape, from 1",
+}
 """Explanations of the scores by name."""
 
 
@@ -49,22 +49,27 @@ def render_page(results: Results, surfaces: Mapping[str, PageSurface]) -> str:
     # The content security policy allows only the page's own scripts and style, identified by their hashes
     scripts = [(_TEMPLATE / name).read_text(encoding="utf-8").strip() + "\n" for name in _SCRIPTS]
     style = (_TEMPLATE / "page.css").read_text(encoding="utf-8")
+    hashes = " ".join(map(_source_hash, scripts))
     policy = (
-        f"default-src 'none'; script-src {' '.join(map(_source_hash, scripts))}; style-src {_source_hash(style)}; "
+        f"default-src 'none'; script-src {hashes}; style-src {_source_hash(style)}; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
     classes = data["classes"]
-    indices = {name: i for i, name in enumerate(results.names)}
     members: list[list[int]] = [[] for _ in classes] or [[]]
     for i, shape in enumerate(data["shapes"]):
-        members[shape["label"] if classes else 0].append(i)
-    packed = [surfaces[name] for name in results.names if name in surfaces]
+        group = shape["label"] if classes else 0
+        members[group].append(i)
+    packed = [base64_text(surfaces[name].packed()) for name in results.names if name in surfaces]
+    indices = {name: i for i, name in enumerate(results.names)}
+    outliers = []
+    for row in results.outliers[:N_OUTLIERS]:
+        outliers.append({**row, "place": indices.get(row["name"])})
     return environment.get_template("page.html.j2").render(
         results=results,
         title=_title(results, data),
         data=data,
         members=members,
-        surfaces="\n".join(base64_text(surface.packed()) for surface in packed),
+        surfaces="\n".join(packed),
         scripts=scripts,
         style=style,
         policy=policy,
@@ -76,21 +81,21 @@ def render_page(results: Results, surfaces: Mapping[str, PageSurface]) -> str:
         n_worst=N_WORST,
         plot=(_PLOT_WIDTH, _PLOT_HEIGHT),
         config=_config_rows(results.config),
-        outliers=[
-            {**row, "place": indices.get(row["name"])} for row in results.outliers[:N_OUTLIERS]
-        ],
+        outliers=outliers,
         n_repaired=sum(bool(shape["notes"]) for shape in data["shapes"]),
     )
 
 
 def _source_hash(source: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(source.encode()).digest()).decode()}'"
+    digest = hashlib.sha256(source.encode()).digest()
+    return f"'sha256-{base64_text(digest)}'"
 
 
 def _title(results: Results, data: Mapping[str, Any]) -> str:
-    shapes = f"{len(results.names)} shape{'s' * (len(results.names) != 1)}"
-    if data["classes"]:
-        shapes += f" in {len(data['classes'])} class{'es' * (len(data['classes']) != 1)}"
+    shapes = counted(len(results.names), "shape")
+    n_classes = len(data["classes"])
+    if n_classes:
+        shapes += f" in {counted(n_classes, 'class')}"
     names = [system.name for system in results.systems]
     descriptors = names[0] if len(names) == 1 else f"{len(names)} descriptors"
     return f"{shapes}, {descriptors}"
@@ -106,9 +111,19 @@ def _titles(data: Mapping[str, Any]) -> dict[str, str]:
 def _curve(i: int, system: Mapping[str, Any]) -> dict[str, Any]:
     """Return the precision–recall curve of the i-th descriptor in SVG coordinates, with its style, name and values."""
     values = list(zip(*system["curve"], strict=True))
-    points = [(round(x * _PLOT_WIDTH, 1), round((1 - y) * _PLOT_HEIGHT, 1)) for x, y in values]
+    points = []
+    for recall, precision in values:
+        x = round(recall * _PLOT_WIDTH, 1)
+        y = round((1 - precision) * _PLOT_HEIGHT, 1)
+        points.append((x, y))
     path = "M" + " L".join(f"{x} {y}" for x, y in points)
-    return {"style": i, "name": system["name"], "points": points, "path": path, "values": values}
+    return {
+        "style": i,
+        "name": system["name"],
+        "points": points,
+        "path": path,
+        "values": values,
+    }
 
 
 def _config_rows(config: Mapping[str, Any]) -> Sequence[tuple[str, str]]:

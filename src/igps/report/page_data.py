@@ -23,26 +23,24 @@ _DECIMALS = 5
 _MAX_FILTERED = 30  # different values of a column, of which one can be chosen
 _QUERY_SCORES = ("nn", "ft", "st", "map")  # scores that are shown for each query
 # Shapes of a map; more take too long to lay out and to draw in a browser
-_MIN_MAPPED, _MAX_MAPPED = (
-    3,
-    3000,
-)
+_MIN_MAPPED = 3
+_MAX_MAPPED = 3000
 
 
 def data_of(results: Results, surfaces: Mapping[str, PageSurface]) -> dict[str, Any]:
     """Return the data of the page without its surfaces; for `shapes` see `_shapes`, for `systems` `_system_data`."""
-    classes = sorted(set(results.labels or ()))
-    index = {name: i for i, name in enumerate(results.names)}
     sizes = Counter(results.labels or ())
-    # Covers the second tier of every class
-    n_ranked = max(_MIN_RANKED, 2 * max(sizes.values(), default=0))
+    classes = sorted(sizes)
+    index = {name: i for i, name in enumerate(results.names)}
+    largest = max(sizes.values(), default=0)
+    n_ranked = max(_MIN_RANKED, 2 * largest)  # covers the second tier of every class
+    columns = {}
+    for title, column in results.columns.items():
+        columns[title] = [column.get(name) for name in results.names]
     return {
         "classes": classes,
         "shapes": _shapes(results, surfaces, classes),
-        "columns": {
-            title: [column.get(name) for name in results.names]
-            for title, column in results.columns.items()
-        },
+        "columns": columns,
         "systems": [_system_data(system, index, classes, n_ranked) for system in results.systems],
         "filters": _filters(results),
     }
@@ -75,32 +73,43 @@ def _shapes(
     the range of the `potential`. One of several bodies in a file has its `part` and the indices of the others,
     `together`.
     """
-    result = []
-    n_surfaces = 0
     files: dict[str, list[int]] = {}
     for i, name in enumerate(results.names):
         if name in results.parts:
-            files.setdefault(name.removesuffix(f"#{results.parts[name]}"), []).append(i)
-    together = {i: [j for j in bodies if j != i] for bodies in files.values() for i in bodies}
-    for i, name in enumerate(results.names):
-        shape: dict[str, Any] = {
-            "name": name,
-            "label": classes.index(results.labels[i]) if results.labels else -1,
-            "notes": list(results.notes.get(name, ())),
-        }
-        if i in together:
-            shape.update(part=results.parts[name], together=together[i])
-        if name in surfaces:
-            surface = surfaces[name]
-            shape["surface"] = [n_surfaces, len(surface.vertices), len(surface.faces)]
-            measures = (_significant(surface.area), _significant(surface.volume))
-            shape["mesh"] = [surface.n_vertices, surface.n_faces, *measures]
-            shape["unit"] = surface.unit
-            shape["frame"] = surface.frame
-            shape["potential"] = [_significant(value) for value in surface.potential_range]
+            file = name.removesuffix(f"#{results.parts[name]}")
+            files.setdefault(file, []).append(i)
+    shapes: list[dict[str, Any]] = []
+    for name in results.names:
+        shapes.append({"name": name, "label": -1, "notes": list(results.notes.get(name, ()))})
+    for shape, label in zip(shapes, results.labels or (), strict=False):
+        shape["label"] = classes.index(label)
+    for bodies in files.values():
+        for i in bodies:
+            shapes[i]["part"] = results.parts[results.names[i]]
+            shapes[i]["together"] = [other for other in bodies if other != i]
+    n_surfaces = 0
+    for shape in shapes:
+        surface = surfaces.get(shape["name"])
+        if surface is not None:
+            shape |= _surface_data(surface, n_surfaces)
             n_surfaces += 1
-        result.append(shape)
-    return result
+    return shapes
+
+
+def _surface_data(surface: PageSurface, number: int) -> dict[str, Any]:
+    """Return what `_shapes` tells of a surface, which is the one of that number on the page."""
+    return {
+        "surface": [number, len(surface.vertices), len(surface.faces)],
+        "mesh": [
+            surface.n_vertices,
+            surface.n_faces,
+            _significant(surface.area),
+            _significant(surface.volume),
+        ],
+        "unit": surface.unit,
+        "frame": surface.frame,
+        "potential": [_significant(value) for value in surface.potential_range],
+    }
 
 
 def _system_data(
@@ -118,14 +127,14 @@ def _system_data(
     indices = np.array([index[name] for name in system.names])
     distances = np.take_along_axis(system.distances.numpy(), nearest, axis=1)
     scored: dict[str, Any] = dict.fromkeys(("scores", "per_class", "per_query", "curve", "worst"))
-    if system.labels is not None and len(set(system.labels)) < len(
-        system.labels
-    ):  # some shapes share a class
-        scores = retrieval_scores(system.distances, system.labels)
+    labels = system.labels
+    if labels is not None and len(set(labels)) < len(labels):  # some share a class
+        scores = retrieval_scores(system.distances, labels)
         numbers = _scores_of_pairs(scores)
         if not scores.has_single_answers:
             numbers = _scores_of_classes(scores, system, classes)
-        scored |= {**finite(numbers, _DECIMALS), "worst": _worst(system, order, scores, indices)}
+        scored |= finite(numbers, _DECIMALS)
+        scored["worst"] = _worst(system, order, scores, indices)
     return {
         "name": system.name,
         "seconds": system.seconds_per_mesh,
@@ -134,7 +143,7 @@ def _system_data(
         "ranked": base64_text(indices[nearest].astype("<u4").tobytes()),
         "distances": base64_text(distances.astype("<f4").tobytes()),
         **scored,
-        "confusion": None if system.labels is None else _confusion(order, system.labels, classes),
+        "confusion": None if labels is None else _confusion(order, labels, classes),
         "map": _map(system),
     }
 
@@ -169,20 +178,25 @@ def _map(system: System) -> dict[str, Any] | None:
     child below N is a shape, and child N + i is node i.
     """
     distances = system.distances.double().numpy()
-    if not _MIN_MAPPED <= len(distances) <= _MAX_MAPPED or not np.isfinite(distances).all():
+    if not _MIN_MAPPED <= len(distances) <= _MAX_MAPPED:
+        return None
+    if not np.isfinite(distances).all():
         return None
     layout = body_map(distances)
-    clusters = clusters_of(distances, n_resamples=50)
+    low = layout.points.min(axis=0)
     extent = float(np.ptp(layout.points, axis=0).max()) or 1.0
+    points = (layout.points - low) / extent
+    clusters = clusters_of(distances, n_resamples=50)
+    tree = []
+    for one, other, height, _ in clusters.tree.tolist():
+        tree.append([int(one), int(other), _significant(height)])
     return {
-        "points": ((layout.points - layout.points.min(axis=0)) / extent).round(4).tolist(),
+        "points": points.round(4).tolist(),
         "stress": round(layout.stress, 3),
         "cluster": clusters.labels.tolist(),
         "stability": finite(clusters.stability, _DECIMALS),
         "n_stable": sum(stability >= STABLE for stability in clusters.stability),
-        "tree": [
-            [int(a), int(b), _significant(height)] for a, b, height, _ in clusters.tree.tolist()
-        ],
+        "tree": tree,
     }
 
 
@@ -193,11 +207,13 @@ def _confusion(
     if not order.size:
         return None
     codes = np.array([classes.index(label) for label in labels])
-    sizes = np.bincount(codes, minlength=len(classes))[codes] - 1
+    found = codes[order]  # the class at each rank of each query
+    n_others = np.bincount(codes)[codes] - 1  # of the class of each query
+    ranks = np.arange(order.shape[1])
+    queries, in_tier = np.nonzero(ranks < n_others[:, None])
     nearest, tier = np.zeros((2, len(classes), len(classes)), dtype=np.int64)
-    np.add.at(nearest, (codes, codes[order[:, 0]]), 1)
-    rows, columns = np.nonzero(np.arange(order.shape[1]) < sizes[:, None])
-    np.add.at(tier, (codes[rows], codes[order[rows, columns]]), 1)
+    np.add.at(nearest, (codes, found[:, 0]), 1)
+    np.add.at(tier, (codes[queries], found[queries, in_tier]), 1)
     return {"nearest": nearest.tolist(), "tier": tier.tolist()}
 
 
@@ -212,24 +228,28 @@ def _worst(
     before the first shape of the class or, if this is the nearest, those in the first tier.
     """
     _, codes = np.unique(np.asarray(system.labels), return_inverse=True)
-    first_tier = scores.ft.numpy()  # NaN for a shape that is alone in its class
-    queries = np.flatnonzero(first_tier < 1).tolist()
-    is_relevant = codes[order[queries]] == codes[queries][:, None]
+    is_relevant = codes[order] == codes[:, None]
     ranks = (is_relevant.argmax(axis=1) + 1).tolist()
-    worst = sorted(
-        range(len(queries)),
-        key=lambda i: (-ranks[i], first_tier[queries[i]], system.names[queries[i]]),
-    )
-    result = []
-    for i in worst[:N_WORST]:
-        wrong = (
-            np.flatnonzero(~is_relevant[i, : ranks[i] - 1 or int(is_relevant[i].sum())])[:_N_WRONG]
-            + 1
+    first_tier = scores.ft.numpy()  # NaN for a shape that is alone in its class
+
+    def badness(query: int) -> tuple[int, float, str]:
+        return (-ranks[query], first_tier[query], system.names[query])
+
+    queries = np.flatnonzero(first_tier < 1).tolist()
+    queries.sort(key=badness)
+    worst = []
+    for query in queries[:N_WORST]:
+        rank = ranks[query]
+        n_shown = rank - 1 if rank > 1 else int(is_relevant[query].sum())
+        wrong = np.flatnonzero(~is_relevant[query, :n_shown]) + 1
+        worst.append(
+            {
+                "query": int(indices[query]),
+                "rank": rank,
+                "wrong": wrong[:_N_WRONG].tolist(),
+            }
         )
-        result.append(
-            {"query": int(indices[queries[i]]), "rank": ranks[i], "wrong": wrong.tolist()}
-        )
-    return result
+    return worst
 
 
 def finite(value: Any, decimals: int | None = None) -> Any:
@@ -240,7 +260,9 @@ def finite(value: Any, decimals: int | None = None) -> Any:
         return [finite(item, decimals) for item in value]
     if not isinstance(value, float):
         return value
-    return (value if decimals is None else round(value, decimals)) if math.isfinite(value) else None
+    if not math.isfinite(value):
+        return None
+    return value if decimals is None else round(value, decimals)
 
 
 def _significant(value: float) -> float:

@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _VERSION = 4  # raise it whenever other surfaces come out
-_MAX_VERTICES, _MIN_VERTICES = 1200, 150  # of one surface
+_MAX_VERTICES = 1200  # of one surface
+_MIN_VERTICES = 150
 # Size of all surfaces of a page, and of one vertex, which has 19 bytes as text in base 64
 _MAX_BYTES = 20e6
 _BYTES_PER_VERTEX = 19 * 4 / 3
@@ -70,9 +71,8 @@ class PageSurface:
 
 def fitting_vertices(n_shapes: int) -> int:
     """Return the largest number of vertices of each surface that keeps a page of n shapes below 30 MB."""
-    return int(
-        np.clip(_MAX_BYTES / _BYTES_PER_VERTEX / max(n_shapes, 1), _MIN_VERTICES, _MAX_VERTICES)
-    )
+    fitting = _MAX_BYTES / _BYTES_PER_VERTEX / max(n_shapes, 1)
+    return int(np.clip(fitting, _MIN_VERTICES, _MAX_VERTICES))
 
 
 def surfaces_of(
@@ -147,24 +147,24 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int) -> PageSurface
     if len(vertices) > _STEPS:  # fewer would close handles; a face has two bytes for a corner
         raise MeshError(f"{mesh.name}: too many handles to simplify its surface for the page.")
     samples = signature.surface.points
-    potential = np.sqrt(
-        np.square(signature.surface.eigenfunctions, dtype=np.float64) @ (1 / signature.eigenvalues)
-    )
-    distances, nearest = cKDTree(samples).query(vertices, min(_N_NEIGHBOURS, len(samples)))
-    distances = distances.reshape(len(vertices), -1)
-    nearest = nearest.reshape(len(vertices), -1)
+    squares = np.square(signature.surface.eigenfunctions, dtype=np.float64)
+    potential = np.sqrt(squares @ (1 / signature.eigenvalues))
+    neighbours = range(1, 1 + min(_N_NEIGHBOURS, len(samples)))
+    distances, nearest = cKDTree(samples).query(vertices, neighbours)
     weights = 1 / (distances + 1e-6 * mesh.diagonal)
     values = (weights * potential[nearest]).sum(axis=1) / weights.sum(axis=1)
     low = float(values.min())
     high = float(values.max())
+    shades = 255 * (values - low) / ((high - low) or 1)
     rotated = vertices @ page_axes(mesh, samples)
     lowest = rotated.min(axis=0)
     highest = rotated.max(axis=0)
-    in_cube = (rotated - (lowest + highest) / 2) / (highest - lowest).max() + 0.5
+    centre = (lowest + highest) / 2
+    in_cube = (rotated - centre) / (highest - lowest).max() + 0.5
     return PageSurface(
         np.rint(_STEPS * in_cube).astype(np.uint16),
         faces.astype(np.uint16),
-        np.rint(255 * (values - low) / ((high - low) or 1)).astype(np.uint8),
+        np.rint(shades).astype(np.uint8),
         (low, high),
         len(mesh.vertices),
         len(mesh.faces),

@@ -21,7 +21,8 @@ from igps.signature.signature import SignatureConfig
 
 MESHES_FILE = "meshes.json"
 _FORMAT = "igps-meshes-1"
-_RETRIEVAL, _COMPARISON = "distances.npz", "compare.json"
+_RETRIEVAL = "distances.npz"
+_COMPARISON = "compare.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,8 @@ class System:
         """Return the indices (N, N − 1) of the other meshes, nearest first, ties in the order of the meshes."""
         n = len(self.names)
         order = rank(self.distances)
-        return order[order != torch.arange(n)[:, None]].view(n, max(n - 1, 0)).numpy()
+        is_other = order != torch.arange(n)[:, None]
+        return order[is_other].view(n, max(n - 1, 0)).numpy()
 
 
 @dataclass(frozen=True)
@@ -79,31 +81,36 @@ def read_results(folder: Path) -> Results:
         _RETRIEVAL: _read_retrieval,
         _COMPARISON: _read_comparison,
     }
-    times = {name: (folder / name).stat().st_mtime for name in readers if (folder / name).is_file()}
-    if not times:
+    found = [folder / name for name in readers if (folder / name).is_file()]
+    if not found:
         raise FileNotFoundError(
             f"{folder}: no results found. Expected {', '.join(readers)}, which `igps retrieve` and "
             "`igps compare` write with --out."
         )
-    sources = _read_json(folder / MESHES_FILE)
-    notes = dict[str, list[str]]()
-    unused = list[Unused]()
-    for name, note in map(dict.values, _read_rows(folder / "notes.csv")):
+    latest = max(found, key=lambda path: path.stat().st_mtime)
+    results = readers[latest.name](folder)
+    notes: dict[str, list[str]] = {}
+    for row in _read_rows(folder / "notes.csv"):
+        name, note = row.values()
         notes.setdefault(name, []).append(note)
-    for *descriptor, name, error in map(dict.values, _read_rows(folder / "failures.csv")):
-        unused.append(Unused(name, error, None if descriptor in ([], ["all"]) else descriptor[0]))
-    results = readers[max(times, key=lambda name: times[name])](folder)
+    unused = []
+    for row in _read_rows(folder / "failures.csv"):
+        *descriptor, name, error = row.values()
+        concerns_all = descriptor in ([], ["all"])
+        unused.append(Unused(name, error, None if concerns_all else descriptor[0]))
+    sources = _read_json(folder / MESHES_FILE)
     bodies = sources.get("meshes", [])
+    names = [body["file"] for body in bodies]
+    columns = {}
+    for title, values in sources.get("columns", {}).items():
+        columns[title] = dict(zip(names, values, strict=True))
     return replace(
         results,
-        unused=(*unused, *results.unused),
+        unused=tuple(unused),
         notes=notes,
         config=results.config or sources.get("signature", {}),
         parts={body["file"]: body["part"] for body in bodies if body.get("part")},
-        columns={
-            name: {body["file"]: value for body, value in zip(bodies, values, strict=True)}
-            for name, values in sources.get("columns", {}).items()
-        },
+        columns=columns,
         groups=tuple(_read_json(folder / "groups.json")),
         outliers=tuple(_read_json(folder / "outliers.json")),
     )
@@ -113,19 +120,23 @@ def write_sources(folder: Path, dataset: SignatureDataset) -> None:
     """Write meshes.json: names, paths, parts and columns of the bodies, reading options, configuration, and cache."""
     pipeline = dataset.pipeline
     bodies = dataset.bodies
-    summary = {
-        "format": _FORMAT,
-        "meshes": [
+    meshes = []
+    for name, body in zip(bodies.names, bodies, strict=True):
+        meshes.append(
             {
                 "file": name,
                 "path": str(body.path.resolve()),
                 "part": body.part,
                 "number": body.number,
             }
-            for name, body in zip(bodies.names, bodies, strict=True)
-        ],
+        )
+    reading = asdict(pipeline.reading)
+    reading["names"] = pipeline.reading.names_anywhere
+    summary = {
+        "format": _FORMAT,
+        "meshes": meshes,
         "columns": bodies.columns,
-        "reading": {**asdict(pipeline.reading), "names": pipeline.reading.names_anywhere},
+        "reading": reading,
         "signature": asdict(pipeline.config),
         "cache_dir": str(pipeline.cache_dir.resolve()),
     }
@@ -153,11 +164,14 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
             path = Path(mesh["path"]) if meshes is None else meshes / file_name_of(name, part)
             refs.append(BodyRef(path, part, mesh.get("number")))
             names.append(name)
-        columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
-        bodies = Bodies(tuple(refs), tuple(names), None, columns)
-        reading = LoadOptions(**summary["reading"])
+        columns = {}
+        for title, values in summary.get("columns", {}).items():
+            columns[str(title)] = tuple(values)
         return SignatureDataset(
-            bodies, SignatureConfig(**summary["signature"]), summary["cache_dir"], reading=reading
+            Bodies(tuple(refs), tuple(names), None, columns),
+            SignatureConfig(**summary["signature"]),
+            summary["cache_dir"],
+            reading=LoadOptions(**summary["reading"]),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
@@ -167,35 +181,39 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
 
 def _read_retrieval(folder: Path) -> Results:
     config = dict(_read_json(folder / "scores.json").get("config", {}))
-    system = _read_system(folder / _RETRIEVAL, str(config.get("descriptor", "descriptor")))
+    name = str(config.get("descriptor", "descriptor"))
+    system = _read_system(folder / _RETRIEVAL, name)
     return Results("retrieve", system.names, system.labels, (system,), config=config)
 
 
 def _read_comparison(folder: Path) -> Results:
     rows = json.loads((folder / _COMPARISON).read_text())
     systems = []
-    label_of = dict[str, str]()
-    names: dict[str, None] = {}
     for row in rows:
-        path = folder / "distances" / f"{row['descriptor']}.npz"
+        name = row["descriptor"]
+        path = folder / "distances" / f"{name}.npz"
         if row["n_models"] and path.is_file():
-            systems.append(system := _read_system(path, row["descriptor"], row["seconds_per_mesh"]))
-            names.update(dict.fromkeys(system.names))
-            label_of.update(zip(system.names, system.labels or (), strict=False))
+            systems.append(_read_system(path, name, row["seconds_per_mesh"]))
+    names: dict[str, None] = {}  # in the order of their first mention
+    label_of: dict[str, str] = {}
+    for system in systems:
+        names.update(dict.fromkeys(system.names))
+        label_of.update(zip(system.names, system.labels or (), strict=False))
     labels = tuple(label_of[name] for name in names) if label_of else None
     return Results("compare", tuple(names), labels, tuple(systems), rows=tuple(rows))
 
 
 def _read_system(path: Path, name: str, seconds: float | None = None) -> System:
+    labels: tuple[str, ...] = ()
     with np.load(path) as archive:
         names = tuple(archive["names"].tolist())
-        labels = (
-            tuple(str(label) for label in archive["labels"].tolist()) if "labels" in archive else ()
-        )
+        if "labels" in archive:
+            labels = tuple(map(str, archive["labels"].tolist()))
         distances = torch.from_numpy(archive["distances"])
-    if len(labels) not in (0, len(names)) or distances.shape != (len(names), len(names)):
+    n = len(names)
+    if len(labels) not in (0, n) or distances.shape != (n, n):
         raise ValueError(
-            f"{path}: expected distances and labels (or no labels) of {len(names)} meshes, got distances "
+            f"{path}: expected distances and labels (or no labels) of {n} meshes, got distances "
             f"{tuple(distances.shape)} and {len(labels)} labels. Run the command again."
         )
     return System(name, names, labels or None, distances, seconds)

@@ -78,12 +78,9 @@ def scores_table(scores: RetrievalScores) -> str:
         table = text_table(list(PAIR_TITLES.values()), [cells])
         of_queries = "each with one body of its class among those that it asks"
         return f"{table}\npercent, {scores.n_queries} queries, {of_queries}; mAP: mean of 1/rank"
-    names = [name for name in TITLES if name in scores.mean()]
     by_class = {"all": scores.mean(), **scores.per_class()}
-    rows = [
-        [label, *(score_cell(name, row[name]) for name in names)] for label, row in by_class.items()
-    ]
-    lines = [text_table(["", *(TITLES[name] for name in names)], rows, left=[""])]
+    names = [name for name in TITLES if name in scores.mean()]
+    lines = [_table_of_scores(by_class, names)]
     others = "all others" if scores.adr_self is not None else "all that are no queries"
     lines.append(f"percent, {scores.n_queries} queries, each against {others}")
     if scores.n_excluded:
@@ -93,11 +90,22 @@ def scores_table(scores: RetrievalScores) -> str:
     return "\n".join(lines)
 
 
+def _table_of_scores(rows: Mapping[Any, Mapping[str, float]], names: Sequence[str]) -> str:
+    """Return a text table of scores in percent, with a line for each row and a column for each name."""
+    titles = [TITLES[name] for name in names]
+    cells = []
+    for label, scores in rows.items():
+        cells.append([label, *(score_cell(name, scores[name]) for name in names)])
+    return text_table(["", *titles], cells, left=[""])
+
+
 def score_cell(name: str, value: float | None) -> str:
     """Return a score in percent, or a rank, as it stands in tables; a dash if it is not known."""
     if value is None:
         return "–"
-    return f"{value:.0f}" if name == "median_rank" else f"{100 * value:.1f}"
+    if name == "median_rank":
+        return f"{value:.0f}"
+    return f"{100 * value:.1f}"
 
 
 def plain_table(rows: Mapping[str, RetrievalScores], descriptor: str, own: RetrievalScores) -> str:
@@ -106,12 +114,9 @@ def plain_table(rows: Mapping[str, RetrievalScores], descriptor: str, own: Retri
         return ""
     names = ("nn", "map") if own.has_single_answers else ("nn", "ft", "dcg")
     means = {name: scores.mean() for name, scores in rows.items()}
-    cells = [
-        [row, *(score_cell(name, mean[name]) for name in names)] for row, mean in means.items()
-    ]
-    lines = [f"plain numbers beside {descriptor}, percent"]
-    lines.append(text_table(["", *(TITLES[name] for name in names)], cells, left=[""]))
-    ahead = [name for name, mean in means.items() if mean["ft"] >= own.mean()["ft"]]
+    lines = [f"plain numbers beside {descriptor}, percent", _table_of_scores(means, names)]
+    first_tier = own.mean()["ft"]
+    ahead = [name for name, mean in means.items() if mean["ft"] >= first_tier]
     if ahead:
         lines.append(
             f"{', '.join(ahead)} find these classes as well as {descriptor} or better: the classes differ in plain "
@@ -147,20 +152,26 @@ def findings_table(findings: Sequence[Finding]) -> str:
     listed = [finding for finding in findings if not finding.summary]
     of_voxels = ["voxels", "pieces", "thinnest"] if any(one.voxels for one in findings) else []
     titles = ["", *of_voxels, "vertices", "after", "seconds", "MB", "unit", "remarks"]
-    rows: list[list[object]] = []
+    rows = []
     for finding in listed:
         voxels = finding.voxels
-        row: list[object] = [finding.id, *[""] * len(of_voxels)]
+        row: list[object] = [finding.id]
         if voxels is not None:
-            row[1:] = [voxels.n_voxels, voxels.n_pieces, voxels.thinnest]
+            row += [voxels.n_voxels, voxels.n_pieces, voxels.thinnest]
+        elif of_voxels:
+            row += ["", "", ""]
         if finding.error is not None:
-            rows.append([*row, "", "", "", "", "", f"cannot be used: {finding.error}"])
-            continue
-        megabytes = f"{(finding.memory or 0) / 1e6:.0f}"
-        cost = [f"{finding.seconds or 0:.1f}", megabytes]
-        unit = f"{finding.unit} ({finding.unit_from})" if finding.unit else "none"
-        remarks = "; ".join(finding.remarks) or "none"
-        rows.append([*row, finding.n_vertices, finding.n_vertices_after, *cost, unit, remarks])
+            row += ["", "", "", "", "", f"cannot be used: {finding.error}"]
+        else:
+            row += [
+                finding.n_vertices,
+                finding.n_vertices_after,
+                f"{finding.seconds or 0:.1f}",
+                f"{(finding.memory or 0) / 1e6:.0f}",
+                f"{finding.unit} ({finding.unit_from})" if finding.unit else "none",
+                "; ".join(finding.remarks) or "none",
+            ]
+        rows.append(row)
     n_bad = sum(finding.error is not None for finding in listed)
     n_repaired = sum(bool(finding.steps) for finding in findings)
     minutes = sum(finding.seconds or 0 for finding in findings) / 60
@@ -180,16 +191,26 @@ def groups_table(tests: Sequence[GroupTest]) -> str:
         if test.refused is not None:
             rows.append([test.body, *[""] * 7, f"not tested ({sizes}): {test.refused}"])
             continue
-        numbers = (test.permanova_p, test.permanova_q, test.kernel_p, test.kernel_q)
-        interval = f"{test.effect_low:.3f} to {test.effect_high:.3f}"
-        cells = [*(f"{p:.4f}" for p in numbers), f"{test.effect:.3f}", interval]
-        rows.append([test.body, *cells, f"{test.auc:.2f}", sizes])
+        rows.append(
+            [
+                test.body,
+                f"{test.permanova_p:.4f}",
+                f"{test.permanova_q:.4f}",
+                f"{test.kernel_p:.4f}",
+                f"{test.kernel_q:.4f}",
+                f"{test.effect:.3f}",
+                f"{test.effect_low:.3f} to {test.effect_high:.3f}",
+                f"{test.auc:.2f}",
+                sizes,
+            ]
+        )
     lines = [text_table(("body", *titles), rows, left=("body", "n"))]
     lines.append(
         "p: by permutation; q: false discovery rate over the bodies; effect: share of squared distances; n: bodies"
     )
-    tested = [test for test in tests if test.refused is None]
-    if any((test.effect or 0) < 0 or (test.auc is not None and test.auc < 0.5) for test in tested):
+    effects = [test.effect for test in tests if test.effect is not None]
+    areas = [test.auc for test in tests if test.auc is not None]
+    if any(effect < 0 for effect in effects) or any(area < 0.5 for area in areas):
         lines.append(
             "an effect below 0, or an AUC below 0.5, is as good as 0 and 0.5: chance goes both ways"
         )

@@ -92,7 +92,8 @@ def common_views(
         return numbered_views(axes_of(first.vertices)), list(superposed)
     moved = [first.vertices]
     for mesh in meshes[1:]:
-        moved.append(rigid_motion(mesh, first).of(mesh.vertices))
+        motion = rigid_motion(mesh, first)
+        moved.append(motion.of(mesh.vertices))
     return numbered_views(axes_of(first.vertices)), moved
 
 
@@ -114,7 +115,14 @@ def draw_view(
     paint(axis, vertices @ view.axes, mesh.faces, colour, reach)
     for letter, (x, y) in zip(view.letters, _EDGES, strict=False):
         axis.text(
-            x, y, letter, transform=axis.transAxes, ha="center", va="center", fontsize=7, gid="side"
+            x,
+            y,
+            letter,
+            transform=axis.transAxes,
+            ha="center",
+            va="center",
+            fontsize=7,
+            gid="side",
         )
     _draw_bar(axis, mesh.unit)
 
@@ -123,20 +131,23 @@ def _draw_bar(axis: Axes, unit: str | None) -> None:
     """Draw a bar whose length is 1, 2 or 5 times a power of ten, about a third of the picture."""
     left, right = axis.get_xlim()
     bottom, top = axis.get_ylim()
-    longest = 0.35 * (right - left)
+    width = right - left
+    longest = 0.35 * width
     power = 10.0 ** np.floor(np.log10(longest))
     length = max(step * power for step in (1, 2, 5) if step * power <= longest)
-    x = left + 0.05 * (right - left)
+    x = left + 0.05 * width
     y = bottom + 0.04 * (top - bottom)
     axis.plot([x, x + length], [y, y], color="black", linewidth=1.2, solid_capstyle="butt")
-    axis.text(
-        x + length / 2, y, f"{length:g} {unit or '(no unit)'}", ha="center", va="bottom", fontsize=5
-    )
+    middle = x + length / 2
+    text = f"{length:g} {unit or '(no unit)'}"
+    axis.text(middle, y, text, ha="center", va="bottom", fontsize=5)
 
 
 def reach_of(views: Sequence[View], bodies: Sequence[Floats]) -> float:
     """Return the distance from the middle of a picture to its edges that shows each of the bodies in each view."""
-    sides = [
-        np.ptp(vertices @ view.axes, axis=0)[:2].max() for view in views for vertices in bodies
-    ]
+    sides = []
+    for view in views:
+        for vertices in bodies:
+            width_and_height = np.ptp(vertices @ view.axes, axis=0)[:2]
+            sides.append(width_and_height.max())
     return float(0.6 * max(sides))  # with room for the letters
