@@ -19,6 +19,7 @@ FLOORS = (
         "failures",
         "_files",
         "_parameters",
+        "_tensors",
         "_progress",
         "_text",
         "_threads",

@@ -27,7 +27,7 @@ def spheroid(subdivisions, n_samples):
 def test_curvatures_and_thickness_of_a_spheroid():
     """A ball inside that touches at a point is centred on the axis, where the normal meets it."""
     body = spheroid(subdivisions=5, n_samples=6000)
-    measured = local_shape(collate([body]))
+    measured = local_shape(collate([body])[0])
     x, y, z = body.surface.points.T
     slant = np.sqrt((x**2 + y**2) / RADIUS**4 + z**2 / HALF_LENGTH**4)
     of_circles = 1 / (RADIUS**2 * slant)
@@ -48,7 +48,7 @@ def test_a_rough_surface_is_no_thinner():
     points = body.surface.points
     step = 0.001 * np.sqrt(body.area) * np.random.default_rng(0).normal(size=points.shape)
     rough = replace(body, surface=replace(body.surface, points=points + step))
-    thickness = [local_shape(collate([each]))[:, 2] for each in (body, rough)]
+    thickness = [local_shape(collate([each])[0])[:, 2] for each in (body, rough)]
     assert thickness[1] == pytest.approx(thickness[0], abs=0.6)
 
 

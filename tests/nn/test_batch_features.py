@@ -98,13 +98,13 @@ def test_nearest_points_are_those_of_a_loop():
     points = torch.randn(30, 4, generator=torch.Generator().manual_seed(3))
     apart = torch.cdist(points, points).fill_diagonal_(torch.inf)
     assert torch.equal(
-        nearest_neighbours(points, 5),
+        nearest_neighbours(points, n_nearest=5),
         apart.argsort(dim=1)[:, :5],
     )
-    assert nearest_neighbours(points[:3], 5).shape == (3, 2)
+    assert nearest_neighbours(points[:3], n_nearest=5).shape == (3, 2)
     few = torch.arange(30) % 10 == 4
-    for i, found in enumerate(nearest_neighbours(points, 5, few).tolist()):
+    for i, found in enumerate(nearest_neighbours(points, few, 5).tolist()):
         others = [j for j in apart[i].argsort().tolist() if j in (4, 14, 24) and j != i]
         assert found == [*others, *[i] * 5][:5]
     with pytest.raises(ValueError, match="samples: expected at least one of each body, got none"):
-        nearest_neighbours(torch.zeros(0, 3), 4)
+        nearest_neighbours(torch.zeros(0, 3))

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from igps._arrays import Floats, Integers
-from igps.data.batch import SampleBatch, SignatureBatch
+from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.mesh.surface import unit
 
@@ -35,7 +35,7 @@ _MIN_COSINE = 0.2
 _BLOCK_ROWS = 256  # samples whose distances from all samples are in memory at once
 
 
-def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
+def dissimilarity(body: Body, other: Body) -> Floats:
     """Return how much each surface sample of a body differs from the corresponding samples of another body.
 
     The ten corresponding samples are the nearest by the heat kernels (Sun, Ovsjanikov and Guibas 2009) at large times,
@@ -43,9 +43,6 @@ def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
     the heat kernels at small times. For each kind, this is the squared Mahalanobis distance from the mean of the
     corresponding samples, by their covariance, which is large where poses bend the surface. Its logarithm is smoothed
     on the surface and standardised.
-
-    Args:
-        body, other: batches of one body each.
 
     Returns:
         (P,) the exponential of the sum of both, positive.
@@ -57,7 +54,7 @@ def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
     small = _heat_kernels(body, _SMALL_TIMES)
     other_small = _heat_kernels(other, _SMALL_TIMES)
     by_heat = squared_deviations(small, other_small, nearest)
-    points = _points(body.surface, body)
+    points = _points(body)
     shape = _standardised(by_shape, points)
     heat = _standardised(by_heat, points)
     return np.exp(shape + heat)
@@ -70,30 +67,24 @@ def _standardised(deviations: Floats, points: Floats) -> Floats:
     return (smoothed - smoothed.mean()) / scatter
 
 
-def _points(samples: SampleBatch, body: SignatureBatch) -> Floats:
-    """Return the positions of samples (P, 3), over √area."""
-    points = samples.points[0][samples.mask[0]]
-    size = float(body.area[0]) ** 0.5
-    return points.double().numpy() / size
+def _points(body: Body) -> Floats:
+    """Return the positions of the surface samples (P, 3), over √area."""
+    return body.surface.points / body.area**0.5
 
 
-def _heat_kernels(body: SignatureBatch, times: Floats) -> Floats:
+def _heat_kernels(body: Body, times: Floats) -> Floats:
     """Return log(heat kernel · area) at each surface sample, (P, times)."""
-    area = float(body.area[0])
-    is_sample = body.surface.mask[0]
-    eigenfunctions = body.surface.eigenfunctions[0][is_sample]
-    squares = eigenfunctions.double().square().numpy() * area
-    values = body.eigenvalues[0].double().numpy() * area
-    decay = np.exp(-np.outer(values, times))
-    return np.log1p(squares @ decay)
+    eigenfunctions = body.surface.eigenfunctions.astype(np.float64)
+    squares = np.square(eigenfunctions) * body.area
+    exponents = np.outer(body.eigenvalues * body.area, times)
+    return np.log1p(squares @ np.exp(-exponents))
 
 
 def _nearest(one: Floats, other: Floats) -> Integers:
     """Return indices (P, n) of the nearest rows of the other array, each column standardised by it."""
     scale = other.std(axis=0) + 1e-9
-    tree = cKDTree(other / scale)
     ranks = _ranks(_N_CORRESPONDING, len(other))
-    _, nearest = tree.query(one / scale, ranks)
+    _, nearest = cKDTree(other / scale).query(one / scale, ranks)
     return nearest
 
 
@@ -126,16 +117,15 @@ def squared_deviations(own: Floats, others: Floats, nearest: Integers) -> Floats
     return (steps * solved).sum(axis=(1, 2))
 
 
-def local_shape(body: SignatureBatch) -> Floats:
+def local_shape(body: Body) -> Floats:
     """Return (P, 3): the principal curvatures at each surface sample, and the log of the largest ball inside there.
 
     The curvatures, ascending and over the radius of a patch, are those of the linear function of the position that fits
     the normals of the patch (least squares). The body meets `REQUIREMENTS`.
     """
-    points = _points(body.surface, body)
-    is_sample = body.surface.mask[0]
-    directions = body.surface.attributes["surface_direction"][0]
-    normals = unit(directions[is_sample].double().numpy())
+    points = _points(body)
+    directions = body.surface.attributes["surface_direction"]
+    normals = unit(directions.astype(np.float64))
     slopes = _slopes_of_normals(points, normals)
     symmetric = (slopes + slopes.transpose(0, 2, 1)) / 2
     curvatures = np.linalg.eigvalsh(symmetric)
@@ -163,16 +153,18 @@ def _slopes_of_normals(points: Floats, normals: Floats) -> Floats:
     n_patch = max(_MIN_PATCH, math.ceil(n_expected))
     ranks = _ranks(n_patch, len(points))
     distances, patch = cKDTree(points).query(points, ranks)
+    patch_normals = normals[patch]
+    cosines = np.einsum("pkc,pc->pk", patch_normals, normals)
     weights = np.clip(1 - np.square(distances / _PATCH), 0, 1)
-    cosines = np.einsum("pkc,pc->pk", normals[patch], normals)
     weights *= cosines > _MIN_COSINE
     offsets = points[patch] - points[:, None]
     steps = offsets @ axes / _PATCH
     ones = np.ones_like(steps[:, :, :1])
     terms = np.concatenate([ones, steps], axis=2)
-    weighted = (terms * weights[:, :, None]).transpose(0, 2, 1)
+    weighted_terms = terms * weights[:, :, None]
+    weighted = weighted_terms.transpose(0, 2, 1)
     matrix = weighted @ terms + 1e-3 * np.eye(3)  # solvable if all weights but one are 0
-    tilts = normals[patch] @ axes
+    tilts = patch_normals @ axes
     fits = np.linalg.solve(matrix, weighted @ tilts)
     return fits[:, 1:]
 

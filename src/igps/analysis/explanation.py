@@ -11,13 +11,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from igps._arrays import Floats
+from igps._tensors import above_zero
 from igps.analysis.dissimilarity import REQUIREMENTS, dissimilarity
 from igps.analysis.superposition import Movement
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.requirements import Requirements
-from igps.descriptors.size_and_side import SizeAndSide
+from igps.descriptors.size_and_side import SizeAndSide, form_of
 from igps.nn.batch_features import WEIGHT, BatchFeatures
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.histograms.base import DescriptionPart, SampleHistogram
@@ -90,9 +91,10 @@ def explain(
         raise ValueError(
             f"one, other: expected batches of one body, got {len(one)} and {len(other)} bodies."
         )
-    for batch in (one, other):
-        # Samples of the surface, and their normals, show how far places differ
-        (REQUIREMENTS if weights is None else Requirements()).check(batch)
+    # Samples of the surface, and their normals, show how far places differ
+    requirements = REQUIREMENTS if weights is None else Requirements()
+    requirements.check(one)
+    requirements.check(other)
     descriptor = copy.deepcopy(descriptor).double().eval()
     headless = without_head(descriptor)
     pair = (_with_weights(one), _with_weights(other))
@@ -102,10 +104,9 @@ def explain(
     parts = _part_shares(descriptor, shares)
     samples = _sample_shares(descriptor, pair, units, shares)
     if weights is None:
-        weights = (dissimilarity(one, other), dissimilarity(other, one))
-    half, other_half = (distance / 2 * own / own.sum() for own in weights)
-    on_first = _on_surface(half, samples[0])
-    on_second = _on_surface(other_half, samples[1])
+        weights = (dissimilarity(one[0], other[0]), dissimilarity(other[0], one[0]))
+    on_first = _on_surface(distance / 2, weights[0], samples[0])
+    on_second = _on_surface(distance / 2, weights[1], samples[1])
     return Explanation(distance, parts, samples, (on_first, on_second))
 
 
@@ -113,23 +114,26 @@ def explain_bodies(
     descriptor: Descriptor, dataset: SignatureDataset, moved: Movement | None
 ) -> Explanation:
     """Divide the distance of the two bodies of a dataset, by how far their places moved, if that is known."""
+    one = dataset[0].signature
+    other = dataset[1].signature
     weights = None
     if moved is not None:
-        first, second = (dataset[i].signature.surface.points for i in (0, 1))
-        weights = moved.weights(first, second)
-    one, other = (collate([dataset[i].signature]) for i in (0, 1))
-    return explain(descriptor, one, other, weights)
+        weights = moved.weights(one.surface.points, other.surface.points)
+    return explain(descriptor, collate([one]), collate([other]), weights)
 
 
-def _on_surface(values: Floats, like: Shares) -> Shares:
-    """Return shares of the surface samples alone."""
-    return {"interior": np.zeros(len(like["interior"])), "surface": values}
+def _on_surface(half: float, weights: Floats, like: Shares) -> Shares:
+    """Divide half of a distance among the surface samples alone, in proportion to their weights."""
+    shares = half * weights / weights.sum()
+    return {"interior": np.zeros(len(like["interior"])), "surface": shares}
 
 
 def without_head(descriptor: Descriptor) -> Descriptor:
     """Return the descriptor without its head: it describes the histogram cells, followed by side and size, if any."""
     histograms = _histograms(descriptor)
-    return descriptor.wrap(histograms) if isinstance(descriptor, SizeAndSide) else histograms
+    if isinstance(descriptor, SizeAndSide):
+        return descriptor.wrap(histograms)
+    return histograms
 
 
 def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:
@@ -156,8 +160,7 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
         if error <= _TOLERANCE * distance:
             break
     total = roots[:, :n].sum(dim=0)
-    tiny = torch.finfo(total.dtype).tiny
-    units = torch.where(total > 0, gradient[:n] / total.clamp_min(tiny), 0)
+    units = torch.where(total > 0, gradient[:n] / above_zero(total), 0)
     return torch.cat([units, gradient[n:]]), distance
 
 
@@ -169,12 +172,12 @@ def _with_roots(contents: Tensor, n_cells: int) -> Tensor:
 def _distances_of_roots(descriptor: Descriptor, pairs: Tensor) -> Tensor:
     """Return the distances (M,) of M pairs of bodies, given (2, M, cells + others) with roots of the cells."""
     n = _n_cells(descriptor)
-    inner = descriptor.descriptor if isinstance(descriptor, SizeAndSide) else descriptor
+    form_descriptor = form_of(descriptor)
     descriptions = []
     for roots in pairs:
         form = roots[:, :n].square()
-        if isinstance(inner, EmbeddedDescriptor):
-            form = inner.head(form)
+        if isinstance(form_descriptor, EmbeddedDescriptor):
+            form = form_descriptor.head(form)
         descriptions.append(torch.cat([form, roots[:, n:]], dim=1))
     return descriptor.distances(*descriptions).diagonal()
 
@@ -223,13 +226,14 @@ def share_density(shares: Shares, samples: Mapping[SampleKind, Floats], points: 
 
 
 def _histograms(descriptor: Descriptor) -> HistogramDescriptor:
-    inner = descriptor.descriptor if isinstance(descriptor, SizeAndSide) else descriptor
-    inner = inner.descriptor if isinstance(inner, EmbeddedDescriptor) else inner
-    if not isinstance(inner, HistogramDescriptor):
+    found = form_of(descriptor)
+    if isinstance(found, EmbeddedDescriptor):
+        found = found.descriptor
+    if not isinstance(found, HistogramDescriptor):
         raise ValueError(
             f"descriptor: expected histograms of samples (interior, rich, pretrained, ...), got {descriptor.name!r}."
         )
-    return inner
+    return found
 
 
 def _n_cells(descriptor: Descriptor) -> int:

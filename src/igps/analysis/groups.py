@@ -108,43 +108,44 @@ def group_test(  # noqa: PLR0913 (two arrays, and settings that all have a defau
     _check_numbers_of_bodies(n, groups=groups, strata=strata, covariates=numbers)
     _check_finite(vectors=vectors, covariates=numbers)
     untested = GroupTest(body, dict(sorted(Counter(groups).items())))
+
+    def refused(reason: str) -> GroupTest:
+        return replace(untested, refused=reason)
+
     reason = _obstacle(untested.sizes, group, stratum)
     if reason is not None:
-        return replace(untested, refused=reason)
-    if np.ptp(vectors, axis=0).max() <= _ROUNDING * np.abs(vectors).max():
-        return replace(untested, refused="all bodies are identical.")
+        return refused(reason)
+    extent = np.ptp(vectors, axis=0).max()
+    if extent <= _ROUNDING * np.abs(vectors).max():
+        return refused("all bodies are identical.")
     design = design_of(group, stratum, numbers)
     n_added = design.added.shape[1]
     if n_added < len(untested.sizes) - 1:
-        return replace(untested, refused="covariates or strata determine the groups.")
+        return refused("covariates or strata determine the groups.")
     nuisance = design.nuisance
     freedom = n - nuisance.shape[1] - n_added
     if freedom < 3:
-        reason = f"{n} bodies are too few for so many strata and covariates."
-        return replace(untested, refused=reason)
+        return refused(f"{n} bodies are too few for so many strata and covariates.")
     residual = np.eye(n) - nuisance @ nuisance.T  # projection
     centred = vectors - vectors.mean(axis=0)
     total = centred @ centred.T
     gram = residual @ total @ residual
-    if np.trace(gram) <= _ROUNDING * np.square(vectors).sum():
-        reason = "the vectors do not differ beyond what covariates and strata explain."
-        return replace(untested, refused=reason)
+    variation = np.trace(gram)
+    if variation <= _ROUNDING * np.square(vectors).sum():
+        return refused("the vectors do not differ beyond what covariates and strata explain.")
     kernel = residual @ _gaussian_kernel(gram) @ residual
     random = np.random.default_rng(seed)
     traces = _permuted_traces(gram, kernel, design, stratum, n_permutations, random)
-    unexplained = np.trace(gram) - traces.of_covariates
-    share = traces.of_groups / np.maximum(unexplained, _TINY)  # grows with pseudo-F
+    unexplained = np.maximum(variation - traces.of_covariates, _TINY)
+    share = traces.of_groups / unexplained  # grows with pseudo-F
     odds = share[0] / max(1 - share[0], np.finfo(float).eps)
     # Covariates explain a share of the permuted groups, which the kernel of the residuals cannot contain
     kernel_share = np.maximum(1 - traces.overlap / n_added, _ROUNDING)
-    sizes = np.bincount(group)
     squares = _squares_for_effect(gram, residual, design, group, freedom)
+    sizes = np.bincount(group)
     effect = _effects(squares, group, [np.ones((1, size)) for size in sizes])
     low, high = _interval(squares, group, n_bootstraps, random)
     factor = n / np.prod(sizes) if len(sizes) == 2 else 1 / n
-    auc = None
-    if n_repeats:
-        auc = _auc(total, nuisance, group, n_repeats, seed)
     return replace(
         untested,
         permanova_f=float(odds * freedom / n_added),
@@ -154,7 +155,7 @@ def group_test(  # noqa: PLR0913 (two arrays, and settings that all have a defau
         effect=float(effect[0]),
         effect_low=low,
         effect_high=high,
-        auc=auc,
+        auc=_auc(total, nuisance, group, n_repeats, seed) if n_repeats else None,
     )
 
 
@@ -267,7 +268,8 @@ def _interval(
         return None, None
     weights = []
     for size in np.bincount(group):
-        weights.append(random.multinomial(size, np.full(size, 1 / size), n_bootstraps))
+        equal = np.full(size, 1 / size)
+        weights.append(random.multinomial(size, equal, n_bootstraps))
     # NaN if a group is drawn as copies of one body, which have no variance
     with np.errstate(invalid="ignore"):
         effects = _effects(squares, group, weights)
@@ -292,7 +294,7 @@ def _obstacle(sizes: Mapping[str, int], group: Integers, stratum: Integers) -> s
     """Return the reason why groups cannot be tested, or None."""
     if len(sizes) < 2:
         return f"expected two groups, got {', '.join(sizes) or 'none'} alone."
-    smallest = min(sizes, key=lambda name: sizes[name])
+    smallest = min(sizes, key=sizes.__getitem__)
     if sizes[smallest] < _MIN_GROUP_SIZE:
         return f"{smallest} has {sizes[smallest]} bodies, a test needs at least {_MIN_GROUP_SIZE} in each group."
     counts = np.zeros((stratum.max() + 1, group.max() + 1), dtype=int)
@@ -318,16 +320,21 @@ def _orthonormal(columns: Floats, tolerance: float) -> Floats:
     return left[:, values > tolerance]
 
 
-def _whitened(gram: Floats) -> Floats:
-    """Return G (G + ρ)⁻¹ of a Gram matrix G; the ridge ρ makes the trace the degrees of freedom, see `group_test`."""
+def _positive_eigenpairs(gram: Floats) -> tuple[Floats, Floats]:
+    """Return the positive eigenvalues (k,) of a Gram matrix, ascending, and their eigenvectors (N, k)."""
     values, axes = np.linalg.eigh(gram)
     is_positive = values > _ROUNDING * values[-1]
-    values = values[is_positive]
-    axes = axes[:, is_positive]
+    return values[is_positive], axes[:, is_positive]
+
+
+def _whitened(gram: Floats) -> Floats:
+    """Return G (G + ρ)⁻¹ of a Gram matrix G; the ridge ρ makes the trace the degrees of freedom, see `group_test`."""
+    values, axes = _positive_eigenpairs(gram)
     freedom = min(len(gram) / _BODIES_PER_DEGREE, _MAX_RANK_SHARE * len(values))
 
     def excess(log_ridge: float) -> float:
-        return float((values / (values + np.exp(log_ridge))).sum()) - freedom
+        shares = values / (values + np.exp(log_ridge))
+        return float(shares.sum()) - freedom
 
     # Bracket of the root: at the first every term exceeds the share of the rank, at the second the sum is below freedom
     smallest = values[0] * (1 / _MAX_RANK_SHARE - 1) / 2
@@ -358,12 +365,14 @@ def _traces(matrix: Floats, basis: Floats, orders: Integers) -> Floats:
     """Return the trace of bᵀ M b for a basis b (N, k) with its rows in each of the orders (count, N)."""
     count, n = orders.shape
     moved = basis[orders.T].reshape(n, -1)
-    return np.einsum("ij,ij->j", matrix @ moved, moved).reshape(count, -1).sum(axis=1)
+    products = np.einsum("ij,ij->j", matrix @ moved, moved)
+    return products.reshape(count, -1).sum(axis=1)
 
 
 def _p_value(values: Floats) -> float:
     """Return the share of values at least as large as the first; ties within rounding count."""
-    return float((values >= values[0] - _ROUNDING * values.max()).mean())
+    least = values[0] - _ROUNDING * values.max()
+    return float((values >= least).mean())
 
 
 def _effects(squares: Floats, group: Integers, weights: Sequence[Any]) -> Floats:
@@ -382,7 +391,8 @@ def _effects(squares: Floats, group: Integers, weights: Sequence[Any]) -> Floats
     variances = [mean(a, a) / 2 for a in range(len(members))]
     between: Any = 0
     for a, b in combinations(range(len(members)), 2):
-        between = between + shares[a] * shares[b] * (mean(a, b) - variances[a] - variances[b])
+        apart = mean(a, b) - variances[a] - variances[b]
+        between = between + shares[a] * shares[b] * apart
     within: Any = 0
     for share, variance in zip(shares, variances, strict=True):
         within = within + share * variance
@@ -399,15 +409,14 @@ def _auc(gram: Floats, nuisance: Floats, group: Integers, n_repeats: int, seed: 
     from sklearn.metrics import roc_auc_score
     from sklearn.model_selection import RepeatedStratifiedKFold
 
-    values, axes = np.linalg.eigh(gram)
-    is_positive = values > _ROUNDING * values[-1]
-    coordinates = axes[:, is_positive] * np.sqrt(values[is_positive])
-    alphas = values[is_positive].mean() * np.logspace(-3, 3, 7)
+    values, axes = _positive_eigenpairs(gram)
+    coordinates = axes * np.sqrt(values)
+    alphas = values.mean() * np.logspace(-3, 3, 7)
     areas = []
     folds = RepeatedStratifiedKFold(n_splits=5, n_repeats=n_repeats, random_state=seed)
     for training, test in folds.split(gram, group):
-        fit = np.linalg.lstsq(nuisance[training], coordinates[training], rcond=1e-9)
-        residuals = coordinates - nuisance @ fit[0]
+        effects, *_ = np.linalg.lstsq(nuisance[training], coordinates[training], rcond=1e-9)
+        residuals = coordinates - nuisance @ effects
         classifier = RidgeClassifierCV(alphas)
         classifier.fit(residuals[training], group[training])
         scores = classifier.decision_function(residuals[test])

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.utils._pytree import KeyEntry, MappingKey, register_pytree_node, tree_map_only
 
 from igps._arrays import Floats, Singles
+from igps._tensors import with_axes_of
 from igps.data.indices import Indices, resolve_indices, scalar_index
 from igps.mesh.mesh import Mesh
 from igps.signature.measures import POWERS
@@ -58,27 +59,23 @@ class SampleBatch:
         numbers = torch.arange(n_chosen, dtype=torch.float64, device=self.mask.device)
         mask = numbers < n_present
         if seed is None:
-            priority = torch.rand(self.mask.shape, device=self.mask.device).masked_fill(
-                ~self.mask, -1
-            )
-            index = priority.topk(n_chosen).indices
+            priority = torch.rand(self.mask.shape, device=self.mask.device)
+            index = priority.masked_fill(~self.mask, -1).topk(n_chosen).indices
         else:
             start = _START_OF_SEED_0 if seed == 0 else _random_start(seed)
-            steps = (n_present.double() / n_samples).clamp(min=1) * (numbers + start)
-            index = torch.searchsorted(
-                self.mask.cumsum(dim=1), steps.long().clamp(max=n_present - 1) + 1
-            )
+            step = (n_present.double() / n_samples).clamp(min=1)
+            rank = (step * (numbers + start)).long().clamp(max=n_present - 1)
+            index = torch.searchsorted(self.mask.cumsum(dim=1), rank + 1)
         index = index.masked_fill(~mask, 0)
-        rows = (index + n_padded * torch.arange(n_shapes, device=index.device)[:, None]).flatten()
-        padding = None if not torch.compiler.is_compiling() and bool(mask.all()) else ~mask
+        first_rows = n_padded * torch.arange(n_shapes, device=index.device)
+        rows = (first_rows[:, None] + index).flatten()
+        has_padding = torch.compiler.is_compiling() or not bool(mask.all())
 
         def take(values: Tensor) -> Tensor:
             taken = values.flatten(0, 1).index_select(0, rows).unflatten(0, (n_shapes, n_chosen))
-            return (
-                taken
-                if padding is None
-                else taken.masked_fill_(padding[(..., *[None] * (values.ndim - 2))], 0)
-            )
+            if not has_padding:
+                return taken
+            return taken.masked_fill_(with_axes_of(~mask, taken), 0)
 
         attributes = {name: take(values) for name, values in self.attributes.items()}
         return SampleBatch(take(self.points), take(self.eigenfunctions), mask, attributes)
@@ -156,16 +153,15 @@ class SignatureBatch:
         return len(self.ids)
 
     def __repr__(self) -> str:
-        samples = [f"{kind} {tuple(x.mask.shape)}" for kind, x in self._kinds().items()]
-        names = ", ".join(self.ids[:2]) + (", …" if len(self) > 2 else "")
+        names = ", ".join(self.ids[:2])
+        more = ", …" if len(self) > 2 else ""
+        interior = tuple(self.interior.mask.shape)
+        surface = tuple(self.surface.mask.shape)
         n_classes = len(self.labels.unique())
         return (
-            f"SignatureBatch({len(self)} bodies: {names}; {self.eigenvalues.shape[-1]} eigenpairs, "
-            f"{', '.join(samples)} samples, {n_classes} classes, {self.device})"
+            f"SignatureBatch({len(self)} bodies: {names}{more}; {self.eigenvalues.shape[-1]} eigenpairs, "
+            f"interior {interior}, surface {surface} samples, {n_classes} classes, {self.device})"
         )
-
-    def _kinds(self) -> dict[str, SampleBatch]:
-        return {"interior": self.interior, "surface": self.surface}
 
     # `for x, y in loader` would unpack two bodies; write `for batch in loader` and batch.labels, or batch.bodies().
     __iter__ = None
@@ -182,16 +178,14 @@ class SignatureBatch:
             return self[i : i + 1].to("cpu")._body(0)
         indices = resolve_indices(index, len(self))
         rows: slice | Tensor = torch.tensor(indices, dtype=torch.int64, device=self.labels.device)
-        if (
-            isinstance(index, slice) and (index.step or 1) > 0
-        ):  # slices give views, but tensors allow no negative step
+        # Slices give views, but tensors allow no negative step
+        if isinstance(index, slice) and (index.step or 1) > 0:
             rows = index
-        return replace(
-            self.map(lambda values: values[rows]),
-            ids=tuple(self.ids[i] for i in indices),
-            meshes=None if self.meshes is None else tuple(self.meshes[i] for i in indices),
-            units=None if self.units is None else tuple(self.units[i] for i in indices),
-        )
+        chosen = self.map(lambda values: values[rows])
+        meshes = self.meshes and tuple(self.meshes[i] for i in indices)
+        units = self.units and tuple(self.units[i] for i in indices)
+        ids = tuple(self.ids[i] for i in indices)
+        return replace(chosen, ids=ids, meshes=meshes, units=units)
 
     @property
     def device(self) -> torch.device:
@@ -251,35 +245,35 @@ class SignatureBatch:
         return map(self.to("cpu")._body, range(len(self)))
 
     def _body(self, i: int) -> Body:
-        eigenvalues = self.eigenvalues[i][torch.isfinite(self.eigenvalues[i])].numpy()
-        interior, surface = (
-            _samples_of(batch, i, len(eigenvalues)) for batch in (self.interior, self.surface)
-        )
-        mesh = None if self.meshes is None else self.meshes[i]
+        padded = self.eigenvalues[i]
+        eigenvalues = padded[torch.isfinite(padded)].numpy()
         return Body(
             eigenvalues,
-            interior,
-            surface,
+            _samples_of(self.interior, i, len(eigenvalues)),
+            _samples_of(self.surface, i, len(eigenvalues)),
             float(self.area[i]),
             float(self.volume[i]),
             self.ids[i],
-            mesh,
+            None if self.meshes is None else self.meshes[i],
             {} if self.measures is None else _known(self.measures[i]),
         )
 
 
 def _joined(parts: Sequence[Tensor], padding: float = 0) -> Tensor:
     """Concatenate tensors along the first dimension, padded to the largest size along the other dimensions."""
-    shape = [max(sizes) for sizes in zip(*(part.shape[1:] for part in parts), strict=True)]
+    sizes = [part.shape[1:] for part in parts]
+    shape = [max(along) for along in zip(*sizes, strict=True)]
     joined = _empty((sum(map(len, parts)), *shape), parts[0])
     start = 0
     for part in parts:
-        rows = joined[start : start + len(part)]
+        end = start + len(part)
+        rows = joined[start:end]
+        behind = rows
         if list(part.shape[2:]) == shape[1:]:  # mostly: only what lies behind the part is padded
-            rows = rows[:, part.shape[1] :] if shape else rows[:0]
-        rows.fill_(padding)
-        joined[(slice(start, start + len(part)), *map(slice, part.shape[1:]))] = part
-        start += len(part)
+            behind = rows[:, part.shape[1] :] if shape else rows[:0]
+        behind.fill_(padding)
+        rows[tuple(map(slice, part.shape))] = part
+        start = end
     return joined
 
 
@@ -294,17 +288,22 @@ def _empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
 
 
 def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
-    names, *others = (sorted(part.attributes) for part in parts)
-    if differing := [other for other in others if other != names]:
-        raise ValueError(
-            f"attributes: all bodies must carry the same, got {names} and {differing[0]}."
-        )
-    points, eigenfunctions, mask = (
-        _joined([getattr(part, name) for part in parts])
-        for name in ("points", "eigenfunctions", "mask")
+    names = sorted(parts[0].attributes)
+    for part in parts:
+        others = sorted(part.attributes)
+        if others != names:
+            raise ValueError(
+                f"attributes: all bodies must carry the same, got {names} and {others}."
+            )
+    attributes = {}
+    for name in names:
+        attributes[name] = _joined([part.attributes[name] for part in parts])
+    return SampleBatch(
+        _joined([part.points for part in parts]),
+        _joined([part.eigenfunctions for part in parts]),
+        _joined([part.mask for part in parts]),
+        attributes,
     )
-    attributes = {name: _joined([part.attributes[name] for part in parts]) for name in names}
-    return SampleBatch(points, eigenfunctions, mask, attributes)
 
 
 def _known(measures: Tensor) -> dict[str, float]:
@@ -335,6 +334,7 @@ class _Aside:
     units: tuple[str | None, ...] | None = field(default=None, compare=False)
 
 
+_Context = TypeVar("_Context")
 _TENSORS = ("eigenvalues", "interior", "surface", "area", "volume", "labels")
 _SAMPLE_TENSORS = ("points", "eigenfunctions", "mask", "attributes")
 
@@ -356,8 +356,13 @@ def _flatten_samples(samples: SampleBatch) -> tuple[list[Any], None]:
     return [samples.points, samples.eigenfunctions, samples.mask, dict(samples.attributes)], None
 
 
-def _named(names: Sequence[str], values: Sequence[Any]) -> list[tuple[KeyEntry, Any]]:
-    return [(MappingKey(name), value) for name, value in zip(names, values, strict=True)]
+def _named(
+    names: Sequence[str], flat: tuple[Sequence[Any], _Context]
+) -> tuple[list[tuple[KeyEntry, Any]], _Context]:
+    """Return flattened tensors with their names."""
+    values, context = flat
+    named = zip(names, values, strict=True)
+    return [(MappingKey(name), value) for name, value in named], context
 
 
 # For `torch.export.export(descriptor, (batch,))` and `torch.func`. These two entries in PyTorch's table of containers
@@ -369,10 +374,7 @@ register_pytree_node(
     serialized_type_name="igps.SignatureBatch",
     to_dumpable_context=lambda aside: "",
     from_dumpable_context=lambda text: _Aside(),
-    flatten_with_keys_fn=lambda batch: (
-        _named((*_TENSORS, "measures"), _flatten(batch)[0]),
-        _flatten(batch)[1],
-    ),
+    flatten_with_keys_fn=lambda batch: _named((*_TENSORS, "measures"), _flatten(batch)),
 )
 register_pytree_node(
     SampleBatch,
@@ -381,8 +383,5 @@ register_pytree_node(
     serialized_type_name="igps.SampleBatch",
     to_dumpable_context=lambda _: "",
     from_dumpable_context=lambda _: None,
-    flatten_with_keys_fn=lambda samples: (
-        _named(_SAMPLE_TENSORS, _flatten_samples(samples)[0]),
-        None,
-    ),
+    flatten_with_keys_fn=lambda samples: _named(_SAMPLE_TENSORS, _flatten_samples(samples)),
 )

@@ -2,10 +2,11 @@
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import wraps
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
 import torch
 from torch import nn
@@ -13,6 +14,8 @@ from torch import nn
 from igps.nn.descriptor import NAME, Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, Head
 from igps.nn.specification import IN_FOLDER, build_module, load_module
+
+Parameters = ParamSpec("Parameters")
 
 _YAML = (".yaml", ".yml")
 # Limits of a YAML file, which may come from strangers: its size, and the values in it, which aliases can multiply
@@ -30,6 +33,25 @@ def is_descriptor_file(path: str | Path) -> bool:
     return is_named_so or is_folder
 
 
+def with_values(make: Callable[Parameters, Descriptor]) -> Callable[Parameters, Descriptor]:
+    """Let a function make its descriptor on the CPU if the default device is "meta", without values to check.
+
+    A descriptor among its arguments stays where it is.
+    """
+
+    @wraps(make)
+    def made(*arguments: Parameters.args, **options: Parameters.kwargs) -> Descriptor:
+        if torch.get_default_device().type != "meta":
+            return make(*arguments, **options)
+        with torch.device("cpu"):
+            descriptor = make(*arguments, **options)
+        is_given = any(isinstance(x, Descriptor) for x in (*arguments, *options.values()))
+        return descriptor if is_given else descriptor.to("meta")
+
+    return made
+
+
+@with_values
 def load(path: str | Path) -> Descriptor:
     """Load a descriptor from a file or folder, in evaluation mode, with its `card`. No code from the file runs.
 
@@ -49,9 +71,6 @@ def load(path: str | Path) -> Descriptor:
         FileNotFoundError: there is no such file.
         ValueError: the file is damaged, or does not hold a descriptor.
     """
-    if torch.get_default_device().type == "meta":  # without values, which are checked here
-        with torch.device("cpu"):
-            return load(path).to("meta")
     if str(path).lower().endswith(_YAML):
         module = _written_module(Path(path))
         card: dict[str, Any] = {}

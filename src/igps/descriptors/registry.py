@@ -7,10 +7,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, get_args
 
-import torch
-
 from igps._parameters import check_one_of
-from igps.descriptors.from_file import is_descriptor_file, load
+from igps.descriptors.from_file import is_descriptor_file, load, with_values
 from igps.descriptors.measures import Measures
 from igps.descriptors.size_and_side import SIDE, SIZE, Mirror, Size, SizeAndSide, keeps_size
 from igps.descriptors.with_attributes import WithAttributes
@@ -53,6 +51,7 @@ _SIZE_OR_SIDE = re.compile(r"\+(?:size|side)(?=\+|$)")
 _ATTRIBUTE = re.compile(r"\+(\w+)(?:=(\d+\.?\d*|\.\d+))?")
 
 
+@with_values
 def descriptor(
     which: str | Path | Descriptor,
     *,
@@ -87,17 +86,6 @@ def descriptor(
         ValueError: no descriptor has this name, or the file is not valid, see `load`; or the
             descriptor has no such layout to learn.
     """
-    if torch.get_default_device().type == "meta":  # without values, which are checked here
-        with torch.device("cpu"):
-            made = descriptor(
-                which,
-                size=size,
-                mirror=mirror,
-                units=units,
-                learnable=learnable,
-                n_training_samples=n_training_samples,
-            )
-        return made if isinstance(which, Descriptor) else made.to("meta")
     check_one_of(get_args(Size), size=size)
     check_one_of(get_args(Mirror), mirror=mirror)
     if size == "auto" and units is None:

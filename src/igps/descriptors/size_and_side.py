@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from igps._parameters import check_one_of
+from igps._tensors import above_zero
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.mesh.mesh import MILLIMETRES, millimetres
 from igps.nn.axes import InteriorDistance, PairTwist
@@ -216,7 +217,7 @@ def signed_volumes(batch: SignatureBatch) -> Tensor:
     vectors = torch.cat([vectors, vectors[:, 1:3] @ moments], dim=1)
     indices = list(combinations(range(_N_VECTORS), 3))
     triples = vectors[:, torch.tensor(indices, device=vectors.device)]
-    lengths = triples.norm(dim=3).prod(dim=2).clamp_min(torch.finfo(triples.dtype).tiny)
+    lengths = above_zero(triples.norm(dim=3).prod(dim=2))
     return torch.linalg.det(triples) / lengths.pow(2 / 3)
 
 
@@ -236,6 +237,11 @@ def _log_sizes(batch: SignatureBatch) -> Tensor:
     factors = [millimetres(unit) for unit in units]
     shifts = torch.tensor(factors, dtype=size.dtype, device=size.device).log()
     return size + shifts[:, None] * shifts.new_tensor([2.0, 3.0])
+
+
+def form_of(descriptor: Descriptor) -> Descriptor:
+    """Return a descriptor without size and side."""
+    return descriptor.descriptor if isinstance(descriptor, SizeAndSide) else descriptor
 
 
 def scale_of(descriptor: Descriptor) -> float | None:

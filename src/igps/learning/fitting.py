@@ -17,7 +17,7 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
-from igps.descriptors.size_and_side import SizeAndSide
+from igps.descriptors.size_and_side import SizeAndSide, form_of
 from igps.descriptors.with_numbers import N_NUMBERS, Numbers, WithNumbers
 from igps.learning.shortcuts import shortcuts
 from igps.nn.description import check_centres, describe
@@ -65,8 +65,9 @@ class Classification:
     @property
     def predicted(self) -> list[str | None]:
         """The most probable class of each body; None for an unknown body."""
-        best = zip(self.probabilities.argmax(dim=1).tolist(), self.unknown.tolist(), strict=True)
-        return [None if is_unknown else self.classes[i] for i, is_unknown in best]
+        best = self.probabilities.argmax(dim=1).tolist()
+        found = zip(best, self.unknown.tolist(), strict=True)
+        return [None if is_unknown else self.classes[i] for i, is_unknown in found]
 
 
 def split_head(which: str | Descriptor) -> tuple[Descriptor, Head | None]:
@@ -254,33 +255,32 @@ class _Fitting:
                 out for out in folds_of if _has_pair(labels[out]) and _has_pair(labels[~out])
             ]
         scores = {}
+        means = {}
+        best = candidates[0]
         for candidate in candidates:
             found = self._inner_scores(candidate, rows, labels, folds_of)
-            if found:
-                scores[candidate] = found
-        best = candidates[0]
-        for candidate, found in scores.items():
-            if (
-                best not in scores
-                or fmean(found.values()) > fmean(scores[best].values()) + _MIN_GAIN
-            ):
+            if not found:
+                continue
+            scores[candidate] = found
+            means[candidate] = fmean(found.values())
+            if best not in means or means[candidate] > means[best] + _MIN_GAIN:
                 best = candidate
         return best, scores
 
     def _inner_scores(
         self, candidate: Candidate, rows: Tensor, labels: Tensor, folds_of: Sequence[Tensor]
     ) -> dict[str, float]:
-        if self.goal == "new":
-            fts = []
-            for out in folds_of:
-                head = self.fit_head(candidate, rows[~out], labels[~out], False)
-                x = self.used(candidate, rows)
-                fts.append(_retrieval_means(head, x[out], labels[out])["ft"])
-            return {"ft": fmean(fts)} if fts else {}
+        fts = []
         answers = _Answers(labels.unique())
         for out in folds_of:
             head = self.fit_head(candidate, rows[~out], labels[~out], False)
-            answers.add(head, self.used(candidate, rows)[out], labels[out])
+            x = self.used(candidate, rows)[out]
+            if self.goal == "new":
+                fts.append(_retrieval_means(head, x, labels[out])["ft"])
+            else:
+                answers.add(head, x, labels[out])
+        if fts:
+            return {"ft": fmean(fts)}
         scores = answers.scores()
         return {name: scores[name] for name in ("balanced_accuracy", "auc") if name in scores}
 
@@ -288,9 +288,7 @@ class _Fitting:
         self, rows: Tensor, labels: Tensor, candidates: Sequence[Candidate]
     ) -> dict[str, float]:
         """Return the means over held-out folds of the retrieval scores and, for a classifier, classification scores."""
-        from sklearn.metrics import roc_auc_score
-
-        retrieval: list[dict[str, float]] = []
+        retrieval = []
         unknown_aucs = []
         classes = labels.unique()
         answers = _Answers(classes)
@@ -301,30 +299,37 @@ class _Fitting:
             x = self.used(chosen, rows)
             head = self.fit_head(chosen, rows[~out], labels[~out])
             if _has_pair(labels[out]):
-                scores = _retrieval_means(head, x[out], labels[out])
-                retrieval.append({score: scores[score] for score in ("nn", "ft", "dcg")})
-            if not isinstance(head, ClassifyingHead):
-                continue
-            answers.add(head, x[out], labels[out])
-            # Classes that are left out of the fit of a second classifier
-            is_new = torch.isin(labels, classes[number::_N_FOLDS])
-            unknown = out & is_new
-            known = out & ~is_new
-            fit_to = ~out & ~is_new
-            if bool(unknown.any() and known.any()) and len(labels[fit_to].unique()) > 1:
-                partial = self.fit_head(chosen, rows[fit_to], labels[fit_to], False)
-                assert isinstance(partial, ClassifyingHead)
-                strangeness = torch.cat([partial.strangeness(x[mask]) for mask in (unknown, known)])
-                is_unknown = torch.arange(len(strangeness)) < int(unknown.sum())
-                unknown_aucs.append(float(roc_auc_score(is_unknown, strangeness)))
-        means = {
-            score: fmean(scores[score] for scores in retrieval)
-            for score in (retrieval[0] if retrieval else ())
-        }
+                retrieval.append(_retrieval_means(head, x[out], labels[out]))
+            if isinstance(head, ClassifyingHead):
+                answers.add(head, x[out], labels[out])
+                is_new = torch.isin(labels, classes[number::_N_FOLDS])
+                unknown_aucs += self._unknown_auc(chosen, rows, labels, out, is_new)
+        means = {}
+        for score in ("nn", "ft", "dcg") if retrieval else ():
+            means[score] = fmean(scores[score] for scores in retrieval)
         means |= answers.scores()
         if unknown_aucs:
             means["unknown_auc"] = fmean(unknown_aucs)
         return means
+
+    def _unknown_auc(
+        self, chosen: Candidate, rows: Tensor, labels: Tensor, out: Tensor, is_new: Tensor
+    ) -> list[float]:
+        """Return how well a second classifier, which was not fitted to new classes, tells their held-out bodies.
+
+        An empty list if there are too few bodies.
+        """
+        from sklearn.metrics import roc_auc_score
+
+        fit_to = ~out & ~is_new
+        is_unknown = is_new[out]
+        is_told = bool(is_unknown.any() and not is_unknown.all())
+        if not is_told or len(labels[fit_to].unique()) < 2:
+            return []
+        head = self.fit_head(chosen, rows[fit_to], labels[fit_to], False)
+        assert isinstance(head, ClassifyingHead)
+        strangeness = head.strangeness(self.used(chosen, rows)[out])
+        return [float(roc_auc_score(is_unknown, strangeness))]
 
 
 def _parts_with_numbers(has_prior: bool) -> list[tuple[bool, tuple[LinearPart, ...]]]:
@@ -381,9 +386,8 @@ def classification_scores(
     present = targets.unique().tolist()
     confidences = probabilities.amax(dim=1)
     bins = (confidences * _N_BINS).long()
-    gaps = confidences.new_zeros(_N_BINS + 1).index_add(
-        0, bins, confidences - is_right.to(confidences)
-    )
+    excess = confidences - is_right.to(confidences)
+    gaps = confidences.new_zeros(_N_BINS + 1).index_add(0, bins, excess)
     scores = {
         "accuracy": float(is_right.float().mean()),
         "balanced_accuracy": fmean(float(is_right[targets == c].float().mean()) for c in present),
@@ -429,23 +433,17 @@ def classify(
         raise ValueError(
             f"model: expected names of {len(head.classes)} classes, got {len(names)}. Fit it again."
         )
-    histograms, dataset = _histograms(
-        dataset, base, failures, n_workers=n_workers, progress=progress
-    )
+    options = {"n_workers": n_workers, "progress": progress}
+    histograms, dataset = _histograms(dataset, base, failures, **options)
+    probabilities = head.probabilities(histograms)
     strangeness = head.strangeness(histograms)
-    return Classification(
-        dataset.bodies.names,
-        names,
-        head.probabilities(histograms),
-        strangeness,
-        strangeness > head.strange_from,
-    )
+    is_unknown = strangeness > head.strange_from
+    return Classification(dataset.bodies.names, names, probabilities, strangeness, is_unknown)
 
 
 def classifier_of(model: str | Descriptor) -> tuple[Descriptor, ClassifyingHead]:
     """Return the descriptor of a model and its classifier; raise a ValueError if it has no classifier."""
-    module = descriptor_of(model)
-    module = module.descriptor if isinstance(module, SizeAndSide) else module
+    module = form_of(descriptor_of(model))
     if not isinstance(module, EmbeddedDescriptor) or not isinstance(module.head, ClassifyingHead):
         raise ValueError(
             f"model: expected a classifier, got {module.name}. Fit one with head='classifier'."
@@ -474,13 +472,12 @@ def _histograms(
 
 def _held_out(labels: Tensor, goal: Goal, n_folds: int) -> Iterator[Tensor]:
     """Yield masks (N,) of held-out bodies: folds for known classes, random halves of the classes for new classes."""
-    if (
-        goal == "known"
-    ):  # at least two bodies of the largest class are held out together, as needed for retrieval
-        largest = int(labels.unique(return_counts=True)[1].max())
-        yield from folds(labels, max(2, min(n_folds, largest // 2)))
+    classes, sizes = labels.unique(return_counts=True)
+    if goal == "known":
+        # At least two bodies of the largest class are held out together, as needed for retrieval
+        most = int(sizes.max()) // 2
+        yield from folds(labels, max(2, min(n_folds, most)))
         return
-    classes = labels.unique()
     generator = torch.Generator().manual_seed(0)
     for _ in range(n_folds):
         half = torch.randperm(len(classes), generator=generator)[: len(classes) // 2]
@@ -493,6 +490,9 @@ def _has_pair(labels: Tensor) -> bool:
 
 def _retrieval_means(head: Head | None, histograms: Tensor, labels: Tensor) -> dict[str, float]:
     """Return the mean retrieval scores among held-out bodies; bodies alone in their class are no queries."""
-    vectors = histograms if head is None else head(histograms)
-    distances = (chi_square if head is None else head.distances)(vectors, vectors)
+    if head is None:
+        distances = chi_square(histograms, histograms)
+    else:
+        vectors = head(histograms)
+        distances = head.distances(vectors, vectors)
     return retrieval_scores(distances, labels.tolist()).mean()

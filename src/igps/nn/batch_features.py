@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from igps._tensors import above_zero
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.nn._kernels.batches import map_bodies
 from igps.nn._kernels.neighbours import ball_radii, smallest
@@ -74,25 +75,23 @@ class SampleFeatures:
     def log_potential(self, embedding: nn.Module) -> Tensor:
         """Return the logarithm (N, P) of the barycentroid potential."""
         potential = barycentroid_potential(self.embedded(embedding))
-        return potential.clamp_min(torch.finfo(potential.dtype).tiny).log()
+        return above_zero(potential).log()
 
     def neighbours(self, embedding: nn.Module) -> Tensor:
         """Return the `nearest_neighbours` (N, P, k) of each sample in the embedding."""
         if embedding not in self._neighbours:
             points = self.embedded(embedding)
             mask = self.samples.mask
-            self._neighbours[embedding] = map_bodies(
-                lambda x, m: nearest_neighbours(x, mask=m), points, mask
-            )
+            self._neighbours[embedding] = map_bodies(nearest_neighbours, points, mask)
         return self._neighbours[embedding]
 
     def embedded_directions(self, embedding: nn.Module) -> Tensor:
         """Return unit vectors (N, P, D), in the embedding, towards the surface or, at surface samples, out of it."""
-        other, sign = (
-            (self.batch.surface, 1) if self.kind == "interior" else (self.batch.interior, -1)
-        )
+        is_inside = self.kind == "interior"
+        other = self.batch.surface if is_inside else self.batch.interior
         targets = embedding(other.eigenfunctions, self.batch.eigenvalues, self.batch.area)
-        return sign * map_bodies(nearest_directions, self.embedded(embedding), targets, other.mask)
+        inward = map_bodies(nearest_directions, self.embedded(embedding), targets, other.mask)
+        return inward if is_inside else -inward
 
 
 class BatchFeatures:
@@ -140,28 +139,28 @@ def nearest_directions(
     is_real = (nearest < _FAR_AWAY).unsqueeze(-1)
     rows = indices.flatten(-2).unsqueeze(-1).expand(*indices.shape[:-2], -1, points.shape[-1])
     neighbours = targets.gather(-2, rows).unflatten(-2, indices.shape[-2:])
-    mean = torch.where(is_real, neighbours, 0).sum(dim=-2) / is_real.sum(dim=-2)
+    sums = torch.where(is_real, neighbours, 0).sum(dim=-2)
+    mean = sums / is_real.sum(dim=-2)
     return functional.normalize(mean - points, dim=-1)
 
 
 def nearest_neighbours(
-    points: Tensor, n_nearest: int = N_NEIGHBOURS, mask: Tensor | None = None
+    points: Tensor, mask: Tensor | None = None, n_nearest: int = N_NEIGHBOURS
 ) -> Tensor:
     """Return the indices (..., P, k) of the nearest other points to each of points (..., P, D), nearest first.
 
     Only points in the mask (..., P), by default all, are neighbours. If a point has fewer than k neighbours, its own
     index fills the remaining places. Raises a ValueError if there is no point.
     """
-    if not (n_points := points.shape[-2]):
+    n_points = points.shape[-2]
+    if not n_points:
         raise ValueError("samples: expected at least one of each body, got none.")
+    points = points.detach()
     with full_precision():
-        squares = torch.cdist(
-            points.detach(), points.detach(), compute_mode="use_mm_for_euclid_dist"
-        )
-    squares.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
+        distances = torch.cdist(points, points, compute_mode="use_mm_for_euclid_dist")
+    distances.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
     if mask is not None:
-        squares.masked_fill_(~mask.unsqueeze(-2), torch.inf)
-    nearest, indices = smallest(squares, min(n_nearest, n_points - 1))
-    return torch.where(
-        nearest < torch.inf, indices, torch.arange(n_points, device=points.device)[:, None]
-    )
+        distances.masked_fill_(~mask.unsqueeze(-2), torch.inf)
+    nearest, indices = smallest(distances, min(n_nearest, n_points - 1))
+    own = torch.arange(n_points, device=points.device)
+    return torch.where(nearest < torch.inf, indices, own[:, None])

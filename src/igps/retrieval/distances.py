@@ -69,8 +69,8 @@ def cosine(queries: Tensor, gallery: Tensor) -> Tensor:
     A descriptor of length zero has no direction and raises a ValueError.
     """
     a, b = _as_rows(queries, gallery, non_negative=False)
-    distance = _row_distance(_unit("queries", a), _unit("gallery", b))
-    return distance.square() / 2.0
+    chord = _row_distance(_unit("queries", a), _unit("gallery", b))
+    return chord.square() / 2.0
 
 
 class _ChiSquare(torch.autograd.Function):
@@ -92,12 +92,12 @@ class _ChiSquare(torch.autograd.Function):
         a, b = ctx.saved_tensors
         if torch.is_grad_enabled():  # derivatives of the gradient are needed, too
             distances = _chi_square_by_torch(a, b)
-            first_is_needed, second_is_needed = ctx.needs_input_grad
-            gradients: list[Tensor | None] = [None, None]
-            for i, is_needed in enumerate((first_is_needed, second_is_needed)):
-                if is_needed:
-                    leaf = (a, b)[i]
-                    (gradients[i],) = torch.autograd.grad(distances, leaf, grad, create_graph=True)
+            gradients: list[Tensor | None] = []
+            for rows in (a, b):
+                gradient = None
+                if rows.requires_grad:
+                    (gradient,) = torch.autograd.grad(distances, rows, grad, create_graph=True)
+                gradients.append(gradient)
             return tuple(gradients)
         grad_a = torch.zeros_like(a)
         grad_b = torch.zeros_like(b)
@@ -114,9 +114,10 @@ class _ChiSquare(torch.autograd.Function):
 def _chi_square_by_torch(a: Tensor, b: Tensor) -> Tensor:
     """χ² in operations of PyTorch, which have derivatives of any order and hold arrays (Q, G, cells)."""
     total = a[:, None] + b
-    filled = total > 0
-    difference = torch.where(filled, a[:, None] - b, 0)
-    return (difference.square() / torch.where(filled, total, 1)).sum(dim=-1) / 2
+    is_filled = total > 0
+    difference = torch.where(is_filled, a[:, None] - b, 0)
+    terms = difference.square() / torch.where(is_filled, total, 1)
+    return terms.sum(dim=-1) / 2
 
 
 def _uses_loops(a: Tensor, b: Tensor) -> bool:
@@ -139,12 +140,12 @@ def _sums_by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
         else:
             fill(queries, gallery[part], chi_square, result[:, part])
 
-    is_large = sums.numel() * a.shape[1] > 2 * _TRIPLES_PER_THREAD
-    with Team(None if is_large else 1) as team:
-        length = max(len(a), len(b))
-        step = length
-        if is_large:
-            step = max(1, math.ceil(length / (4 * team.n_threads)))
+    length = max(len(a), len(b))
+    if sums.numel() * a.shape[1] <= 2 * _TRIPLES_PER_THREAD:
+        write(slice(length))
+        return sums
+    with Team() as team:
+        step = max(1, math.ceil(length / (4 * team.n_threads)))
         parts = [slice(begin, begin + step) for begin in range(0, length, step)]
         team.each(write, parts)
     return sums
@@ -192,16 +193,16 @@ def square_root(values: Tensor) -> Tensor:
 
 
 def _unit(name: str, rows: Tensor) -> Tensor:
-    lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
-    limits = torch.finfo(rows.dtype)
     is_traced = torch.compiler.is_compiling()  # traced code cannot depend on values of tensors
     if not is_traced:
+        lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
+        limits = torch.finfo(rows.dtype)
         is_usual = (lengths > limits.tiny**0.25) & (lengths < limits.max**0.25)
         if bool(is_usual.all()):
             return rows / lengths
     # Divide by the largest entry first: the sum of squares of tiny or huge entries leaves the range of the dtype.
     largest = rows.detach().abs().amax(dim=1, keepdim=True)
-    n_empty = 0 if is_traced else (largest == 0).sum().item()
+    n_empty = 0 if is_traced else int((largest == 0).sum())
     if n_empty:
         raise ValueError(
             f"{name}: expected descriptors of non-zero length, {n_empty} of {len(rows)} are all zeros and have no "
@@ -221,14 +222,8 @@ def check_tensor(name: str, value: Any) -> None:
 
 def _as_rows(queries: Tensor, gallery: Tensor, *, non_negative: bool) -> tuple[Tensor, Tensor]:
     """Check both arguments, and return them as (Q, cells) and (G, cells) of one dtype of at least 32 bits."""
-    for name, tensor in (("queries", queries), ("gallery", gallery)):
-        check_tensor(name, tensor)
-        if tensor.ndim < 2 or tensor.shape[1:].numel() == 0:
-            raise ValueError(
-                f"{name}: expected shape (N, ...) with at least one entry per descriptor, got {tuple(tensor.shape)}; "
-                "a single descriptor needs a leading dimension, descriptor[None]"
-            )
-        _check_entries(name, tensor, non_negative=non_negative)
+    _check_descriptions("queries", queries, non_negative=non_negative)
+    _check_descriptions("gallery", gallery, non_negative=non_negative)
     if queries.shape[1:] != gallery.shape[1:]:
         raise ValueError(
             f"gallery: expected descriptors of the shape of the queries, {tuple(queries.shape[1:])}, got "
@@ -238,11 +233,18 @@ def _as_rows(queries: Tensor, gallery: Tensor, *, non_negative: bool) -> tuple[T
         raise ValueError(
             f"gallery: expected the queries' device {queries.device}, got {gallery.device}; move one"
         )
-    dtype = torch.promote_types(torch.promote_types(queries.dtype, gallery.dtype), torch.float32)
+    dtype = torch.promote_types(queries.dtype, gallery.dtype)
+    dtype = torch.promote_types(dtype, torch.float32)
     return queries.flatten(1).to(dtype), gallery.flatten(1).to(dtype)
 
 
-def _check_entries(name: str, tensor: Tensor, *, non_negative: bool) -> None:
+def _check_descriptions(name: str, tensor: Tensor, *, non_negative: bool) -> None:
+    check_tensor(name, tensor)
+    if tensor.ndim < 2 or tensor.shape[1:].numel() == 0:
+        raise ValueError(
+            f"{name}: expected shape (N, ...) with at least one entry per descriptor, got {tuple(tensor.shape)}; "
+            "a single descriptor needs a leading dimension, descriptor[None]"
+        )
     if not tensor.is_floating_point():
         raise ValueError(
             f"{name}: expected a real floating dtype, got {tensor.dtype}; convert with .float()"

@@ -62,30 +62,25 @@ class RetrievalScoresMetric(Metric):
         self.descriptors.append(descriptors.detach())
         self.labels.append(labels)
         if ids is not None:
-            self.ids.append(
-                torch.tensor(
-                    [_hash64(name) for name in ids], dtype=torch.int64, device=labels.device
-                )
-            )
+            hashes = [_hash64(name) for name in ids]
+            self.ids.append(torch.tensor(hashes, dtype=torch.int64, device=labels.device))
 
     def compute(self) -> dict[str, Tensor]:
         """Return the mean scores by name; a ValueError if no two descriptors share a label."""
         descriptors = dim_zero_cat(self.descriptors)
         labels = dim_zero_cat(self.labels)
         if len(self.ids):
-            _, first = np.unique(dim_zero_cat(self.ids).cpu().numpy(), return_index=True)
+            hashes = dim_zero_cat(self.ids).cpu().numpy()
+            _, first = np.unique(hashes, return_index=True)
             unique = torch.from_numpy(np.sort(first)).to(labels.device)
             descriptors = descriptors[unique]
             labels = labels[unique]
-        scores = retrieval_scores(self.distance(descriptors, descriptors), labels)
-        return {
-            name: torch.tensor(value, device=descriptors.device)
-            for name, value in scores.mean().items()
-        }
+        distances = self.distance(descriptors, descriptors)
+        means = retrieval_scores(distances, labels).mean()
+        return {name: torch.tensor(mean, device=distances.device) for name, mean in means.items()}
 
 
 def _hash64(name: str) -> int:
     """A 64-bit hash, the same in every process: processes can exchange numbers, but no strings."""
-    return int.from_bytes(
-        hashlib.blake2b(name.encode(), digest_size=8).digest(), "little", signed=True
-    )
+    digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little", signed=True)

@@ -77,23 +77,20 @@ class RetrievalScores:
     def per_class(self) -> dict[Hashable, dict[str, float]]:
         """Return the means over the scored queries of each class that has any, classes in order of appearance."""
         queries: dict[Hashable, list[int]] = {}
-        for query, (label, scored) in enumerate(
-            zip(self.labels, self.scored.tolist(), strict=True)
-        ):
-            if scored:
-                queries.setdefault(label, []).append(query)
+        for query in self.scored.nonzero().flatten().tolist():
+            queries.setdefault(self.labels[query], []).append(query)
         return {
             label: self._mean_over(torch.tensor(members, device="cpu"))
             for label, members in queries.items()
         }
 
     def _mean_over(self, queries: Tensor) -> dict[str, float]:
-        scores = {name: getattr(self, name) for name in SCORE_NAMES}
-        return {
-            name: float(values[queries].mean())
-            for name, values in scores.items()
-            if values is not None
-        }
+        means = {}
+        for name in SCORE_NAMES:
+            values = getattr(self, name)
+            if values is not None:
+                means[name] = float(values[queries].mean())
+        return means
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,39 +133,40 @@ def retrieval_scores(
     """
     relevant, labels = _ranked_relevance(distances, query_labels, gallery_labels)
     length = relevant.shape[1]
-    ranks = torch.arange(1, length + 2, dtype=torch.float64, device="cpu")
+    ranks = torch.arange(1, length + 1, dtype=torch.float64, device="cpu")
     hits = relevant.cumsum(1)
     n_relevant = hits[:, -1]
     scored = n_relevant > 0
-    dynamic_recall = (hits / ranks[:-1]).cumsum(1)
-    discount = ranks[:-1].log2().reciprocal()
+    precision = hits / ranks
+    discount = ranks.log2().reciprocal()
     discount[0] = 1.0
+    gain = (relevant * discount).sum(1)
     ideal_gain = discount.cumsum(0)[n_relevant.long().clamp_min(1) - 1]
     e_ranks = min(E_MEASURE_RANKS, length)
 
     def at_rank(cumulated: Tensor, last: Tensor) -> Tensor:
-        return cumulated.gather(1, (last.long().clamp(1, cumulated.shape[1]) - 1)[:, None])[:, 0]
+        ends = last.long().clamp(1, cumulated.shape[1]) - 1
+        return cumulated.gather(1, ends[:, None])[:, 0]
 
     def defined(values: Tensor) -> Tensor:
         return values.masked_fill(~scored, torch.nan)
 
     adr_self = None
     if gallery_labels is None:
-        hits_self = torch.cat([torch.ones_like(hits[:, :1]), hits + 1], dim=1)
-        adr_self = defined(
-            at_rank((hits_self / ranks).cumsum(1), n_relevant + 1) / (n_relevant + 1)
-        )
+        own_hit = torch.ones_like(hits[:, :1])
+        precision_self = torch.cat([own_hit, (hits + 1) / (ranks + 1)], dim=1)
+        n_self = n_relevant + 1
+        adr_self = defined(at_rank(precision_self.cumsum(1), n_self) / n_self)
     return RetrievalScores(
         nn=defined(relevant[:, 0]),
         ft=defined(at_rank(hits, n_relevant) / n_relevant),
         st=defined(at_rank(hits, 2 * n_relevant) / n_relevant),
-        e=defined(
-            2 * hits[:, e_ranks - 1] / (e_ranks + n_relevant)
-        ),  # 2/(1/P + 1/R') with P = h/32, R' = h/R
-        dcg=defined((relevant * discount).sum(1) / ideal_gain),
-        adr=defined(at_rank(dynamic_recall, n_relevant) / n_relevant),
+        # 2/(1/P + 1/R') with P = h/32, R' = h/R
+        e=defined(2 * hits[:, e_ranks - 1] / (e_ranks + n_relevant)),
+        dcg=defined(gain / ideal_gain),
+        adr=defined(at_rank(precision.cumsum(1), n_relevant) / n_relevant),
         adr_self=adr_self,
-        map=defined((relevant * hits / ranks[:-1]).sum(1) / n_relevant),
+        map=defined((relevant * hits / ranks).sum(1) / n_relevant),
         labels=labels,
         scored=scored,
         has_single_answers=bool((n_relevant[scored] == 1).all()),
@@ -205,23 +203,23 @@ def precision_recall_curve(
     relevant, _ = _ranked_relevance(distances, query_labels, gallery_labels)
     hits = relevant[relevant.any(1)].cumsum(1)
     n_relevant = hits[:, -1:]
-    precision = hits / torch.arange(1, hits.shape[1] + 1, dtype=torch.float64, device="cpu")
+    ranks = torch.arange(1, hits.shape[1] + 1, dtype=torch.float64, device="cpu")
+    precision = hits / ranks
     interpolated = precision.flip(1).cummax(1).values.flip(1)
     # The tolerance undoes rounding: a recall of 0.55 with 100 relevant entries needs 55 hits, not 56.
     hits_needed = (recall * n_relevant - 1e-6).ceil()
     first_rank = torch.searchsorted(hits, hits_needed)
-    return PrecisionRecallCurve(
-        recall, interpolated.gather(1, first_rank).mean(0), n_queries=len(hits)
-    )
+    mean_precision = interpolated.gather(1, first_rank).mean(0)
+    return PrecisionRecallCurve(recall, mean_precision, n_queries=len(hits))
 
 
 def _ranked_relevance(
     distances: Tensor | NDArray[Any], query_labels: Labels, gallery_labels: Labels | None
 ) -> tuple[Tensor, tuple[Hashable, ...]]:
     """rel(k) of every query, float64 on the CPU: (Q, G), or (Q, Q−1) without the query itself; and the query labels."""
-    order = rank(
-        distances if isinstance(distances, Tensor) else torch.as_tensor(distances, device="cpu")
-    ).cpu()
+    if not isinstance(distances, Tensor):
+        distances = torch.as_tensor(distances, device="cpu")
+    order = rank(distances).cpu()
     n_queries, n_gallery = order.shape
     queries = _label_tuple("query_labels", query_labels, n_queries)
     if gallery_labels is None:
@@ -235,15 +233,9 @@ def _ranked_relevance(
         order = order[others].view(n_queries, max(0, n_queries - 1))
     else:
         gallery = _label_tuple("gallery_labels", gallery_labels, n_gallery)
-    codes: dict[Hashable, int] = {}
-    query_codes, gallery_codes = (
-        torch.tensor(
-            [codes.setdefault(label, len(codes)) for label in labels],
-            dtype=torch.int64,
-            device="cpu",
-        )
-        for labels in (queries, gallery)
-    )
+    codes = {label: code for code, label in enumerate({*queries, *gallery})}
+    query_codes = torch.tensor([codes[label] for label in queries], device="cpu")
+    gallery_codes = torch.tensor([codes[label] for label in gallery], device="cpu")
     relevant = gallery_codes[order] == query_codes[:, None]
     if not relevant.any():
         raise ValueError(
@@ -258,9 +250,8 @@ def _label_tuple(name: str, labels: Labels, n_expected: int) -> tuple[Hashable, 
         if labels.ndim != 1:
             raise ValueError(f"{name}: expected shape (N,), got {tuple(labels.shape)}")
         labels = labels.tolist()
-    if isinstance(labels, str) or not all(
-        isinstance(label, str | numbers.Integral) for label in labels
-    ):
+    is_list = not isinstance(labels, str)
+    if not is_list or not all(isinstance(label, str | numbers.Integral) for label in labels):
         shown = reprlib.repr(labels)
         raise ValueError(
             f"{name}: expected an integer tensor or a sequence of integers or strings, got {shown}"

@@ -62,11 +62,11 @@ class VectorMap:
         """(N, F) descriptions to (N, D) vectors."""
         if self.components is None or self.mean is None:
             return np.ascontiguousarray(self._features(descriptions), dtype=np.float32)
-        blocks = [
-            (self._features(descriptions[i : i + _BLOCK_ROWS]) - self.mean) @ self.components.T
-            for i in range(0, len(descriptions), _BLOCK_ROWS)
-        ]
-        return np.concatenate([*blocks, np.zeros((0, len(self.components)), dtype=np.float32)])
+        blocks: list[Singles] = [np.zeros((0, len(self.components)), dtype=np.float32)]
+        for first in range(0, len(descriptions), _BLOCK_ROWS):
+            features = self._features(descriptions[first : first + _BLOCK_ROWS])
+            blocks.append((features - self.mean) @ self.components.T)
+        return np.concatenate(blocks)
 
     def arrays(self) -> dict[str, Any]:
         """Return the fields that are not None by name, for `numpy.savez`."""
@@ -75,9 +75,8 @@ class VectorMap:
     @classmethod
     def of_arrays(cls, arrays: Any) -> Self:
         """Restore a map from its `arrays`."""
-        fields = {
-            name: arrays[name] for name in ("weights", "mean", "components") if name in arrays
-        }
+        names = ("weights", "mean", "components")
+        fields = {name: arrays[name] for name in names if name in arrays}
         return cls(str(arrays["searched_by"]), **fields)  # type: ignore[arg-type]
 
     def _features(self, descriptions: Singles) -> Singles:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from igps._tensors import above_zero
 from igps.descriptors.pretrained._merge_tree import merge_trees
 from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import SampleFeatures
@@ -119,8 +120,7 @@ class PieceHistogram(SampleHistogram):
         largest = torch.linalg.eigvalsh(covariance.unflatten(3, (3, 3)))[..., -1]
         sizes = n_points[..., 0] / mask.sum(dim=1)[:, None, None]
         squared_lengths = 12 * torch.where(is_small[..., 0], 0, largest) / sizes
-        tiny = torch.finfo(points.dtype).tiny
-        log_lengths = squared_lengths.clamp_min(tiny).log2() / 2
+        log_lengths = above_zero(squared_lengths).log2() / 2
         piece_weights = sums(weights[..., None].to(points.dtype))
         by_size = soft_memberships(sizes.log2(), self.sizes) * piece_weights
         by_length = soft_memberships(log_lengths, self.lengths)

@@ -36,14 +36,12 @@ def map_bodies(
     tensors = (points, others, *more)
     if torch.compiler.is_compiling():
         return function(*tensors)
-    n_bodies = (
-        1
-        if uses_loops(points.device)
-        else max(1, BLOCK // (points.shape[1] * others.shape[1] or 1))
-    )
-    return torch.cat(
-        [function(*batch) for batch in zip(*(x.split(n_bodies) for x in tensors), strict=True)]
-    )
+    n_bodies = 1
+    if not uses_loops(points.device):
+        n_pairs = points.shape[1] * others.shape[1]
+        n_bodies = max(1, BLOCK // max(1, n_pairs))
+    in_batches = [tensor.split(n_bodies) for tensor in tensors]
+    return torch.cat([function(*batch) for batch in zip(*in_batches, strict=True)])
 
 
 def map_by_size(
@@ -59,47 +57,59 @@ def map_by_size(
     """
     if torch.compiler.is_compiling() or batch.device.type == "meta":
         return function(batch)
-    sizes: list[list[int]] = torch.stack(
-        [_last(kind.mask) for kind in (batch.interior, batch.surface)], dim=1
-    ).tolist()
-    read = [[min(pair) for pair in zip(size, n_read, strict=True)] for size in sizes]
-    groups: list[list[int]] = []
-    for i in sorted(range(len(read)), key=read.__getitem__, reverse=True):
-        pairs = zip(read[groups[-1][0]], read[i], strict=True) if groups else ()
-        if groups and all(
-            abs(a - b) <= max(_MAX_PADDING * max(a, b), _FREE_PADDING) for a, b in pairs
-        ):
-            groups[-1].append(i)
-        else:
-            groups.append([i])
+    lengths = torch.stack([_last(batch.interior.mask), _last(batch.surface.mask)], dim=1)
+    sizes: list[list[int]] = lengths.tolist()
+    read = [
+        (min(n_interior, n_read[0]), min(n_surface, n_read[1])) for n_interior, n_surface in sizes
+    ]
+    groups = _of_about_one_size(read)
     if len(groups) > 1 and uses_loops(batch.device):
         # One body is a view of the batch, but several are copied, which costs more than a call for a large body.
         small = [group for group in groups if max(read[group[0]]) <= _FREE_PADDING]
-        groups = [*small, *([i] for group in groups if group not in small for i in group)]
+        large = [group for group in groups if group not in small]
+        groups = small + [[i] for group in large for i in group]
 
     def cut_to(members: list[int]) -> SignatureBatch:
-        n_interior, n_surface = (
-            max(kind) for kind in zip(*(sizes[i] for i in members), strict=True)
-        )
+        n_interior = max(sizes[i][0] for i in members)
+        n_surface = max(sizes[i][1] for i in members)
         interior = batch.interior.map(lambda values: values[:, :n_interior])
         surface = batch.surface.map(lambda values: values[:, :n_surface])
         return replace(batch, interior=interior, surface=surface)
 
-    def result(group: list[int]) -> Tensor:
-        return function(
-            cut_to(group)[group[0] : group[0] + 1] if len(group) == 1 else cut_to(group)[group]
-        )
-
     if len(groups) == 1:
         return function(cut_to(groups[0]))
+    results = []
+    for group in groups:
+        is_one = len(group) == 1
+        members = slice(group[0], group[0] + 1) if is_one else group
+        results.append(function(cut_to(group)[members]))
     order = torch.tensor([i for group in groups for i in group], device=batch.device)
-    return torch.cat([result(group) for group in groups])[order.argsort()]
+    return torch.cat(results)[order.argsort()]
 
 
 def _last(mask: Tensor) -> Tensor:
     """Return the numbers (N,) of the last true entries of a mask (N, P), counted from 1, or 0 without any."""
     numbers = mask * torch.arange(1, mask.shape[1] + 1, device=mask.device)
     return functional.pad(numbers, (1, 0)).amax(dim=1)
+
+
+def _of_about_one_size(sizes: list[tuple[float, float]]) -> list[list[int]]:
+    """Return the numbers of bodies in groups of about one size, from the largest to the smallest."""
+    groups: list[list[int]] = []
+    for number in sorted(range(len(sizes)), key=sizes.__getitem__, reverse=True):
+        if groups and _are_near(sizes[groups[-1][0]], sizes[number]):
+            groups[-1].append(number)
+        else:
+            groups.append([number])
+    return groups
+
+
+def _are_near(size: tuple[float, float], other: tuple[float, float]) -> bool:
+    for a, b in zip(size, other, strict=True):
+        padding = abs(a - b)
+        if padding > _FREE_PADDING and padding > _MAX_PADDING * max(a, b):
+            return False
+    return True
 
 
 def on_one_thread(
@@ -120,7 +130,8 @@ def on_one_thread(
         return tensor
 
     batch.map(collect)
-    learned = [x for x in (*module.parameters(), *module.buffers()) if x.requires_grad]
+    tensors = (*module.parameters(), *module.buffers())
+    learned = [tensor for tensor in tensors if tensor.requires_grad]
     if not torch.is_grad_enabled() or not (inputs or learned):
         with one_thread():
             return function(batch)

@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from igps._arrays import Integers, Real, Singles
+from igps._arrays import Integers, Real
 from igps._compiled import compiled
 from igps.nn._kernels import batches
 from igps.nn._precision import full_precision
@@ -78,50 +78,62 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     points = points.to(dtype)
     directions = directions.to(dtype)
     if not torch.compiler.is_compiling():
-        if (n_points := int(mask.sum(dim=1).min())) < _RANK:
-            raise ValueError(
-                f"samples: expected at least {_RANK} of each body for its balls, got {n_points}."
-            )
-        if not (torch.isfinite(points[mask]).all() and torch.isfinite(directions[mask]).all()):
-            raise ValueError("samples: expected finite points and directions, got NaN or infinity.")
-    differentiable = torch.is_grad_enabled() and (points.requires_grad or directions.requires_grad)
-    if differentiable or not batches.uses_loops(points.device):
-        radii = batches.map_bodies(_radii, points, directions, mask)
+        _check_samples(points[mask], directions[mask], mask)
+    has_gradient = torch.is_grad_enabled() and (points.requires_grad or directions.requires_grad)
+    if has_gradient or not batches.uses_loops(points.device):
+        radii = batches.map_bodies(_radii_by_torch, points, directions, mask)
     else:
         radii = torch.ones_like(points[..., :2])
-        for body_radii, x, n, real in zip(radii, points, directions, mask, strict=True):
-            curvatures = np.zeros((int(real.sum()), 2), body_radii.numpy().dtype)
-            row = np.empty(len(curvatures), curvatures.dtype)
-            write_curvatures(_columns(x[real]), _columns(n[real]), _MIN_SINE, row, curvatures)
-            body_radii[real] = 1 / torch.from_numpy(curvatures)
+        for number, is_real in enumerate(mask):
+            x = points[number, is_real]
+            radii[number, is_real] = _radii_by_loops(x, directions[number, is_real])
     return torch.where(mask[:, :, None], radii.clamp(_MIN_RADIUS, _MAX_RADIUS), 1)
 
 
-def _radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
+def _check_samples(points: Tensor, directions: Tensor, mask: Tensor) -> None:
+    n_points = int(mask.sum(dim=1).min())
+    if n_points < _RANK:
+        raise ValueError(
+            f"samples: expected at least {_RANK} of each body for its balls, got {n_points}."
+        )
+    if not (torch.isfinite(points).all() and torch.isfinite(directions).all()):
+        raise ValueError("samples: expected finite points and directions, got NaN or infinity.")
+
+
+def _radii_by_loops(points: Tensor, directions: Tensor) -> Tensor:
+    """Return radii (P, 2) for points and directions (P, 3) of one body, without gradients."""
+    x = points.detach().T.contiguous().numpy()
+    n = directions.detach().T.contiguous().numpy()
+    row = np.empty(len(points), x.dtype)
+    curvatures = np.zeros((len(points), 2), x.dtype)
+    write_curvatures(x, n, _MIN_SINE, row, curvatures)
+    return 1 / torch.from_numpy(curvatures)
+
+
+def _radii_by_torch(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     """Return radii (N, P, 2) by differentiable operations of PyTorch."""
     # In double precision, as matrix products lose digits of the nearest points, which decide.
     dtype = points.dtype
-    points, directions = (
-        x.masked_fill(~mask[:, :, None], 0).double() for x in (points, directions)
-    )
+    is_padding = ~mask
+    points = points.masked_fill(is_padding[:, :, None], 0).double()
+    directions = directions.masked_fill(is_padding[:, :, None], 0).double()
     with full_precision():
         lengths = points.square().sum(dim=2)
-        squares = (lengths[:, :, None] + lengths[:, None] - 2 * points @ points.mT).clamp_min(0)
+        squares = lengths[:, :, None] + lengths[:, None] - 2 * points @ points.mT
+        squares = squares.clamp_min(0)
         # n·(x − y): the depth of each point y below the tangent plane at x
         depth = (directions * points).sum(dim=2, keepdim=True) - directions @ points.mT
-    excluded = ~mask[:, None, :] | torch.eye(mask.shape[1], dtype=torch.bool, device=points.device)
+    is_self = torch.eye(mask.shape[1], dtype=torch.bool, device=points.device)
+    is_excluded = is_padding[:, None, :] | is_self
     min_height = squares.sqrt() * _MIN_SINE
     sides = []
     for height in (depth, -depth):
-        counts = (height > min_height) & ~excluded
-        radii = torch.where(counts, squares / torch.where(counts, 2 * height, 1), torch.inf)
-        sides.append(radii.topk(_RANK, dim=2, largest=False).values[..., -1])
+        counts = (height > min_height) & ~is_excluded
+        diameters = torch.where(counts, 2 * height, 1)
+        radii = torch.where(counts, squares / diameters, torch.inf)
+        nearest = radii.topk(_RANK, dim=2, largest=False).values
+        sides.append(nearest[..., -1])
     return torch.stack(sides, dim=2).to(dtype)
-
-
-def _columns(vectors: Tensor) -> Singles:
-    """Return vectors (P, 3) as an array (3, P)."""
-    return vectors.detach().T.contiguous().numpy()
 
 
 @compiled()

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, library
 
+from igps._tensors import with_axes_of
 from igps.nn._kernels import batches
 from igps.nn._kernels.pair_loops import VALUES
 from igps.nn._kernels.pairs_by_loops import CompiledCount, Layout
@@ -54,21 +55,26 @@ def count_pairs(
         (N, C(C+1)/2, B, ...) of sum 1 each, in the type of the first inputs, float32 at least; rows by `class_pairs`.
     """
     dtype = torch.promote_types(pairs[0].inputs[0].dtype, torch.float32)
-    tensors = [weights, *(tensor for pair in pairs for tensor in (*pair.inputs, *pair.centres))]
+    tensors = [weights]
+    for pair in pairs:
+        tensors += [*pair.inputs, *pair.centres]
     tensors = [tensor.to(dtype) for tensor in tensors]
+    templates = [
+        k
+        for pair in pairs
+        for k, template in enumerate(TEMPLATES)
+        if pair.between is template.between
+    ]
+    is_compiled = torch.compiler.is_compiling() and not _is_exporting()
     with torch.autocast(classes.device.type, enabled=False):
-        templates = [
-            k
-            for pair in pairs
-            for k, template in enumerate(TEMPLATES)
-            if pair.between is template.between
-        ]
-        if torch.compiler.is_compiling() and not _is_exporting() and len(templates) == len(pairs):
+        if is_compiled and len(templates) == len(pairs):
             counts = _operator(classes, n_classes, templates, mask, tensors)
         else:
             counts = _count(classes, n_classes, pairs, mask, tensors)
-        n_points = mask.sum(dim=1).double().view(-1, *[1] * (counts.ndim - 1))
-        return (counts / (n_points * (n_points - 1) / 2)).to(dtype)
+        n_points = mask.sum(dim=1).double()
+        n_pairs = n_points * (n_points - 1) / 2
+        shares = counts / with_axes_of(n_pairs, counts)
+        return shares.to(dtype)
 
 
 def _count(
@@ -79,12 +85,12 @@ def _count(
     tensors: list[Tensor],
 ) -> Tensor:
     """Return float64 counts (N, C(C+1)/2, B, ...), by the back end for the device and type of the tensors."""
-    if batches.uses_loops(classes.device) and tensors[0].dtype in (torch.float32, torch.float64):
-        counts: Tensor = CompiledCount.apply(
-            Layout(classes, n_classes, tuple(pairs), mask), *tensors
-        )
-        return counts
-    return count_by_torch(classes, n_classes, pairs, mask, *tensors)
+    has_loops = tensors[0].dtype in (torch.float32, torch.float64)
+    if not has_loops or not batches.uses_loops(classes.device):
+        return count_by_torch(classes, n_classes, pairs, mask, *tensors)
+    layout = Layout(classes, n_classes, tuple(pairs), mask)
+    counts: Tensor = CompiledCount.apply(layout, *tensors)
+    return counts
 
 
 def _from_templates(templates: Sequence[int], tensors: list[Tensor]) -> list[PairValues]:
@@ -108,10 +114,10 @@ def _operator(
 def _(
     classes: Tensor, n_classes: int, templates: list[int], mask: Tensor, tensors: list[Tensor]
 ) -> Tensor:
-    bins = [len(centres) for centres in centres_of(_from_templates(templates, tensors))]
-    return classes.new_empty(
-        mask.shape[0], n_classes * (n_classes + 1) // 2, *bins, dtype=torch.float64
-    )
+    pairs = _from_templates(templates, tensors)
+    bins = [len(centres) for centres in centres_of(pairs)]
+    n_rows = len(class_pairs(n_classes))
+    return classes.new_empty(mask.shape[0], n_rows, *bins, dtype=torch.float64)
 
 
 @library.custom_op(
@@ -158,13 +164,8 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 def _backward(ctx: Any, upstream: Tensor) -> tuple[None, None, None, None, list[Tensor]]:
     classes, mask, *tensors = ctx.saved_tensors
-    return (
-        None,
-        None,
-        None,
-        None,
-        _gradients(upstream, classes, ctx.n_classes, ctx.templates, mask, tensors),
-    )
+    gradients = _gradients(upstream, classes, ctx.n_classes, ctx.templates, mask, tensors)
+    return None, None, None, None, gradients
 
 
 _operator.register_autograd(_backward, setup_context=_setup_context)
@@ -175,25 +176,35 @@ def check_pairs(pairs: Sequence[PairValues], mask: Tensor) -> None:
 
     Under `torch.compile` and `torch.export` only shapes are checked, as traced code cannot look at values.
     """
-    for x in (x for pair in pairs for x in pair.inputs):
-        if x.shape[:2] != mask.shape:
+    inputs = [values for pair in pairs for values in pair.inputs]
+    for values in inputs:
+        if values.shape[:2] != mask.shape:
             n = mask.shape[1]
-            shape = tuple(x.shape[1:])
+            shape = tuple(values.shape[1:])
             raise ValueError(f"points: expected values for each of {n} points, got shape {shape}.")
     if torch.compiler.is_compiling():
         return
-    if (n_points := int(mask.sum(dim=1).min())) < 2:
+    n_points = int(mask.sum(dim=1).min())
+    if n_points < 2:
         raise ValueError(f"points: expected at least two points to form a pair, got {n_points}.")
-    for pair, x in ((p, x) for p in pairs for x in p.inputs):
-        dtype = torch.promote_types(x.dtype, torch.float32)
-        max_square = torch.finfo(dtype).max / 8
-        # Point by point only if the norm of all inputs is too large, or padding holds infinity or NaN.
-        if float(torch.linalg.vector_norm(x.detach(), dtype=dtype)) ** 2 < max_square:
-            continue
-        real = x.detach()[mask]
-        if not bool(torch.isfinite(real).all()):
-            raise ValueError("points: expected finite values, got NaN or infinity.")
-        if VALUES not in pair.kinds and not bool((real.square().sum(dim=-1) < max_square).all()):
-            raise ValueError(
-                "points: expected distances that can be squared, got larger ones. Choose a larger unit."
-            )
+    for pair in pairs:
+        for values in pair.inputs:
+            _check_values(values.detach(), mask, are_squared=VALUES not in pair.kinds)
+
+
+def _check_values(values: Tensor, mask: Tensor, are_squared: bool) -> None:
+    """Raise a ValueError unless the values (N, P, ...) of real points are finite, and so their squares if needed."""
+    dtype = torch.promote_types(values.dtype, torch.float32)
+    max_square = torch.finfo(dtype).max / 8
+    # Point by point only if the norm of all inputs is too large, or padding holds infinity or NaN.
+    norm = float(torch.linalg.vector_norm(values, dtype=dtype))
+    if norm**2 < max_square:
+        return
+    real = values[mask]
+    if not bool(torch.isfinite(real).all()):
+        raise ValueError("points: expected finite values, got NaN or infinity.")
+    squares = real.square().sum(dim=-1)
+    if are_squared and not bool((squares < max_square).all()):
+        raise ValueError(
+            "points: expected distances that can be squared, got larger ones. Choose a larger unit."
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -30,7 +31,7 @@ from igps.nn._kernels.pairs_by_torch import (
     Inputs,
     PairValues,
     centres_of,
-    cosine_factors,
+    cosine_products,
     count_by_torch,
     with_tensors,
 )
@@ -79,33 +80,30 @@ class CompiledCount(torch.autograd.Function):
     @staticmethod
     @torch.autocast("cpu", enabled=False)
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        weights, *tensors = ctx.saved_tensors
+        layout = ctx.shapes.layout
+        arguments = ctx.saved_tensors
         if torch.is_grad_enabled():  # for second derivatives, which the loops do not have
-            layout = ctx.shapes.layout
-            needed = ctx.needs_input_grad[1:]
-            counts = count_by_torch(
-                layout.classes, layout.n_classes, layout.pairs, layout.mask, weights, *tensors
+            counts = count_by_torch(*layout, *arguments)
+            leaves = [tensor for tensor in arguments if tensor.requires_grad]
+            found = torch.autograd.grad(
+                counts, leaves, upstream, create_graph=True, allow_unused=True
             )
-            leaves = [
-                t for t, is_needed in zip((weights, *tensors), needed, strict=True) if is_needed
-            ]
-            by_leaves = iter(
-                torch.autograd.grad(counts, leaves, upstream, create_graph=True, allow_unused=True)
-            )
-            return None, *(next(by_leaves) if is_needed else None for is_needed in needed)
-        totals = [torch.zeros_like(tensor) for tensor in (weights, *tensors)]
+            by_leaf = iter(found)
+            return None, *(next(by_leaf) if x.requires_grad else None for x in arguments)
+        _, *tensors = arguments
+        totals = [torch.zeros_like(tensor) for tensor in arguments]
 
         def derivatives(number: int, team: Team) -> tuple[Tensor, list[Tensor]]:
             shape = _Shape(ctx.shapes, number, tensors, upstream[number])
             shape.products = ctx.products[number]
             return shape.order, _sum_shares(shape, shape.gradients, team)
 
-        for number, (order, sums) in enumerate(_map_shapes(derivatives, len(weights))):
+        for number, (order, sums) in enumerate(_map_shapes(derivatives, len(upstream))):
             by_weights, by_centres, *by_inputs = sums
             axes = iter(by_centres)
             inputs = iter(by_inputs)
             gradients = [by_weights.T]
-            for pair in ctx.shapes.layout.pairs:
+            for pair in layout.pairs:
                 gradients += [next(inputs) for _ in pair.inputs]
                 gradients += [next(axes)[: len(centres)] for centres in pair.centres]
             for total, gradient in zip(totals, gradients, strict=True):
@@ -145,9 +143,12 @@ class _Shapes:
         last = torch.iinfo(key.dtype).max  # sorts padding to the end
         self.order = torch.argsort(key.masked_fill(~layout.mask, last), dim=1, stable=True)
         by_order = self.order.unsqueeze(2).expand_as(layout.classes)
-        sorted_classes = layout.classes.gather(1, by_order).int().transpose(1, 2).contiguous()
-        in_order = weights.gather(1, by_order).double().transpose(1, 2).contiguous()
-        self.members = sorted_classes.numpy(), in_order.numpy()
+        sorted_classes = layout.classes.gather(1, by_order).int()
+        sorted_weights = weights.gather(1, by_order).double()
+        self.members = (
+            sorted_classes.mT.contiguous().numpy(),
+            sorted_weights.mT.contiguous().numpy(),
+        )
         self.members_to_count = _without_zeros(*self.members)
         self.n_points: list[int] = layout.mask.sum(dim=1).tolist()
         centres = [x.detach() for x in centres_of(with_tensors(layout.pairs, tensors))]
@@ -158,8 +159,14 @@ class _Shapes:
         self.sums_shape = layout.n_classes, n_cells, n_corners
         self.n_counts = layout.n_classes * (layout.n_classes + 1) // 2, n_cells * n_corners
         kinds = [kind for pair in layout.pairs for kind in pair.kinds]
-        self.n_values = sum(kind != COSINES for kind in kinds)
         self.n_oriented = kinds.count(COSINES)
+        self.n_values = len(kinds) - self.n_oriented
+        self.matrices: list[slice] = []  # those of the values of each pair, none for cosines
+        first = 0
+        for pair in layout.pairs:
+            end = first if COSINES in pair.kinds else first + len(pair.kinds)
+            self.matrices.append(slice(first, end))
+            first = end
         padded = pad_sequence(centres, batch_first=True).numpy()
         empty = np.empty(0)  # in place of the norms and vectors of each shape
         gaps = _inverse_gaps(padded, self.bins)
@@ -171,7 +178,8 @@ def _without_zeros(classes: Indices, weights: Floats) -> tuple[Indices, Floats]:
     largest = weights.max(axis=1, keepdims=True)
     if weights.shape[1] == 1 or not (largest == 1).all():
         return classes, weights
-    return np.take_along_axis(classes, weights.argmax(axis=1)[:, None], axis=1), largest
+    only = weights.argmax(axis=1, keepdims=True)
+    return np.take_along_axis(classes, only, axis=1), largest
 
 
 class _Shape:
@@ -184,25 +192,30 @@ class _Shape:
         tensors: Sequence[Tensor],
         upstream: Tensor | None = None,
     ) -> None:
-        self.shapes, self.n_points = shapes, (n_points := shapes.n_points[number])
+        n_points = shapes.n_points[number]
+        self.shapes = shapes
+        self.n_points = n_points
         self.order = shapes.order[number, :n_points]
         self.products: Tensor | None = None  # of `keep_products`
-        members = shapes.members_to_count if upstream is None else shapes.members
-        classes, weights = (np.ascontiguousarray(x[number, :, :n_points]) for x in members)
-        self.members = classes, weights
-        own = [
-            t.detach()[number].index_select(0, self.order) if t.ndim > 1 else t.detach()
-            for t in tensors
-        ]
-        self.pairs = with_tensors(shapes.layout.pairs, own)
-        self.centred = [
-            _centre(pair.inputs[0]) if DISTANCES in pair.kinds else None for pair in self.pairs
-        ]
-        n_columns = min(n_points, _MAX_COLUMNS)
-        n_matrices = (
-            shapes.n_values if upstream is None else shapes.n_values + 4 * shapes.n_oriented
+        classes, weights = shapes.members_to_count if upstream is None else shapes.members
+        self.members = (
+            np.ascontiguousarray(classes[number, :, :n_points]),
+            np.ascontiguousarray(weights[number, :, :n_points]),
         )
-        n_rows = min(max(1, _BLOCK_SIZE // (n_columns * max(1, n_matrices))), n_columns)
+        own = []
+        for tensor in tensors:
+            is_of_points = tensor.ndim > 1  # and not centres
+            values = tensor.detach()
+            own.append(values[number].index_select(0, self.order) if is_of_points else values)
+        self.pairs = with_tensors(shapes.layout.pairs, own)
+        n_matrices = shapes.n_values
+        self.upstream = np.empty(0)
+        if upstream is not None:
+            n_matrices += 4 * shapes.n_oriented
+            self.upstream = _copy_bins_to_corners(upstream.to(shapes.dtype)).numpy()
+        n_columns = min(n_points, _MAX_COLUMNS)
+        n_rows = max(1, _BLOCK_SIZE // (n_columns * max(1, n_matrices)))
+        n_rows = min(n_rows, n_columns)
         self.block = n_rows, n_columns
         blocks = [
             (row, column)
@@ -211,22 +224,17 @@ class _Shape:
         ]
         n_shares = min(_N_SHARES, len(blocks)) if math.prod(shapes.n_counts) <= _MAX_COUNTS else 1
         self.shares = [blocks[k::n_shares] for k in range(n_shares)]
-        self.upstream = (
-            np.empty(0)
-            if upstream is None
-            else _copy_bins_to_corners(upstream.to(shapes.dtype)).numpy()
-        )
+        self.centred: list[Tensor | None] = []  # points of each pair whose distances are counted
         norms = torch.zeros(shapes.n_values, n_points, dtype=shapes.dtype, device="cpu")
-        row = 0
-        for pair, centred in zip(self.pairs, self.centred, strict=True):
-            if centred is not None:
-                norms[row] = centred.square().sum(dim=1)
-            row += sum(kind != COSINES for kind in pair.kinds)
-        vectors = [
-            torch.stack([x.T for x in pair.inputs], dim=1)
-            for pair in self.pairs
-            if COSINES in pair.kinds
-        ]
+        vectors = []
+        for pair, matrices in zip(self.pairs, shapes.matrices, strict=True):
+            centred = None
+            if DISTANCES in pair.kinds:
+                centred = _centre(pair.inputs[0])
+                norms[matrices] = centred.square().sum(dim=1)
+            elif COSINES in pair.kinds:
+                vectors.append(torch.stack([x.T for x in pair.inputs], dim=1))
+            self.centred.append(centred)
         oriented = norms.new_zeros(0, 2, 0, n_points)
         if vectors:
             oriented = pad_sequence(vectors, batch_first=True).transpose(1, 2).contiguous()
@@ -279,25 +287,21 @@ class _Shape:
                 derivatives,
                 new_row(self.axes, values.shape[2]),
             )
-            # Of the values of each pair, in the order of the pairs
-            n_values = 0
-            n_oriented = 0
-            for pair, centred, totals in zip(self.pairs, self.centred, by_inputs, strict=True):
+            sides = (rows, columns)
+            remaining = iter(by_cosines)
+            for pair, centred, matrices, totals in zip(
+                self.pairs, self.centred, self.shapes.matrices, by_inputs, strict=True
+            ):
                 if COSINES in pair.kinds:
-                    upstream = by_cosines[n_oriented]
-                    sides = (rows, columns)
+                    upstream = next(remaining)
                     _add_by_inputs(_cosine_products, upstream[:3], pair.inputs, sides, totals)
-                    _add_by_points(upstream[3], pair.inputs[0], rows, columns, totals[0])
-                    n_oriented += 1
-                    continue
-                upstream = values[n_values : n_values + len(pair.kinds)]
-                n_values += len(pair.kinds)
-                if centred is None:
-                    _add_by_inputs(pair.between, upstream, pair.inputs, (rows, columns), totals)
+                    _add_by_points(upstream[3], pair.inputs[0], sides, totals[0])
+                elif centred is None:
+                    _add_by_inputs(pair.between, values[matrices], pair.inputs, sides, totals)
                 else:
                     total = totals[0][:, : centred.shape[1]]
-                    _add_by_points(upstream[0], centred, rows, columns, total)
-        return [by_weights, by_centres, *(gradient for totals in by_inputs for gradient in totals)]
+                    _add_by_points(values[matrices.start], centred, sides, total)
+        return [by_weights, by_centres, *itertools.chain(*by_inputs)]
 
     def _slices(self, row: int, column: int) -> tuple[slice, slice]:
         """Return the rows and columns of the block that starts at a row and column."""
@@ -311,14 +315,14 @@ class _Shape:
             return self.products.clone()
         shape = rows.stop - rows.start, columns.stop - columns.start
         values = torch.empty(self.shapes.n_values, *shape, dtype=self.shapes.dtype, device="cpu")
-        n_written = 0
-        for pair, centred in zip(self.pairs, self.centred, strict=True):
+        for pair, centred, matrices in zip(
+            self.pairs, self.centred, self.shapes.matrices, strict=True
+        ):
             if centred is not None:
-                _write_products(centred, rows, columns, values[n_written])
+                _write_products(centred, rows, columns, values[matrices.start])
             elif VALUES in pair.kinds:
                 between = pair.between(*_at(pair.inputs, rows, columns))
-                values[n_written : n_written + len(pair.kinds)] = between[0]
-            n_written += sum(kind != COSINES for kind in pair.kinds)
+                values[matrices] = between[0]
         return values
 
 
@@ -335,19 +339,21 @@ def _add_by_inputs(
     totals: Sequence[Tensor],
 ) -> None:
     """Add derivatives by inputs to totals, from those by values (k, I, J), of which `between` returns (1, k, I, J)."""
-    leaves = [[x.requires_grad_() for x in side] for side in _at(inputs, *sides)]
+    rows, columns = _at(inputs, *sides)
+    leaves = [*rows, *columns]
+    for leaf in leaves:
+        leaf.requires_grad_()
     with torch.enable_grad():
-        values = between(*leaves)
-    gradients = iter(torch.autograd.grad(values, [*leaves[0], *leaves[1]], upstream[None]))
+        values = between(rows, columns)
+    gradients = iter(torch.autograd.grad(values, leaves, upstream[None]))
     for side in sides:
         for total in totals:
             total[side] += next(gradients)[0]
 
 
 def _cosine_products(rows: Inputs, columns: Inputs) -> Tensor:
-    """Return the products (1, 3, I, J) of the `cosine_factors`, of which the cosines are made."""
-    factors = zip(cosine_factors(*rows), cosine_factors(*columns), strict=True)
-    return torch.stack([left @ right.mT for (left, _), (_, right) in factors], dim=1)
+    """Return the `cosine_products`, of which the cosines are made, as one tensor (1, 3, I, J)."""
+    return torch.stack(cosine_products(rows, columns), dim=1)
 
 
 def _inverse_gaps(centres: Numbers, bins: Sequence[int]) -> tuple[Numbers, Booleans]:
@@ -358,8 +364,9 @@ def _inverse_gaps(centres: Numbers, bins: Sequence[int]) -> tuple[Numbers, Boole
         gaps = np.diff(centres[k, :n])
         inverse[k, : n - 1] = 1 / gaps
         mean = float(centres[k, n - 1] - centres[k, 0]) / (n - 1)
-        rounding = 8 * np.finfo(centres.dtype).eps * float(np.abs(centres[k, [0, n - 1]]).max())
-        is_equal[k] = bool((np.abs(gaps - mean) <= rounding).all())
+        largest = float(np.abs(centres[k, [0, n - 1]]).max())
+        rounding = 8 * np.finfo(centres.dtype).eps * largest
+        is_equal[k] = (np.abs(gaps - mean) <= rounding).all()
         if is_equal[k]:
             inverse[k, 0] = 1 / mean
     return inverse, is_equal
@@ -372,8 +379,9 @@ def _centre(points: Tensor) -> Tensor:
     """
     mean = points.mean(dim=0)
     if not bool(mean[-1:].all()):
-        used = (points != 0).any(dim=0).nonzero().flatten()
-        points = points[:, : int(used[-1]) + 1 if len(used) else 0].contiguous()
+        used = (points != 0).any(dim=0).nonzero().flatten().tolist()
+        n_used = used[-1] + 1 if used else 0
+        points = points[:, :n_used].contiguous()
         mean = points.mean(dim=0)
     return points - mean
 
@@ -391,9 +399,10 @@ def _write_products(points: Tensor, rows: slice, columns: slice, out: Tensor) ->
 
 
 def _add_by_points(
-    by_squares: Tensor, points: Tensor, rows: slice, columns: slice, total: Tensor
+    by_squares: Tensor, points: Tensor, sides: tuple[slice, slice], total: Tensor
 ) -> None:
     """Add the derivatives by points (P, D) to a total, from the derivatives by squared distances (I, J)."""
+    rows, columns = sides
     x = points[rows]
     y = points[columns]
     if rows == columns:  # one product in place of two

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from igps._tensors import with_axes_of
 from igps.nn._kernels.batches import BLOCK as _BLOCK
 from igps.nn._kernels.pair_loops import COSINES, DISTANCES, VALUES
 from igps.nn._precision import full_precision
@@ -60,10 +61,10 @@ def oriented_pairs(
     Raises:
         ValueError: points and directions have different shapes.
     """
-    if (shape := directions.shape) != points.shape:
-        raise ValueError(
-            f"directions: expected the shape of the points, {tuple(points.shape)}, got {tuple(shape)}."
-        )
+    expected = tuple(points.shape)
+    shape = tuple(directions.shape)
+    if shape != expected:
+        raise ValueError(f"directions: expected the shape of the points, {expected}, got {shape}.")
     return PairValues((points, directions), (towards, towards, among), _cosines, (COSINES,))
 
 
@@ -78,21 +79,21 @@ def pair_twists(points: Tensor, directions: Tensor, centres: Tensor) -> PairValu
     return PairValues((points, directions), (centres,), _twists)
 
 
-def cosine_factors(points: Tensor, directions: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Return factors of the matrices u·(y − x), v·(x − y) and u·v of points x and y with directions u and v.
+def cosine_products(rows: Inputs, columns: Inputs) -> tuple[Tensor, Tensor, Tensor]:
+    """Return u·(y − x), v·(x − y) and u·v (N, I, J) of points x with directions u and points y with directions v."""
+    row_points, row_directions = _extended(*rows)
+    column_points, column_directions = _extended(*columns)
+    along_row = row_directions @ column_points.mT
+    along_column = row_points @ column_directions.mT
+    among = rows[1] @ columns[1].mT
+    return along_row, along_column, among
 
-    Each matrix is the product of its first factor for the rows (x, u) with its transposed second factor for the columns
-    (y, v).
-    """
+
+def _extended(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (x, 1) and (u, −u·x) for points x with directions u, as u·(y − x) is their product for x and y."""
     own = (directions * points).sum(dim=-1, keepdim=True)
     ones = torch.ones_like(points[..., :1])
-    extended_points = torch.cat([points, ones], dim=-1)
-    extended_directions = torch.cat([directions, -own], dim=-1)
-    return [
-        (extended_directions, extended_points),
-        (extended_points, extended_directions),
-        (directions, directions),
-    ]
+    return torch.cat([points, ones], dim=-1), torch.cat([directions, -own], dim=-1)
 
 
 def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -110,37 +111,43 @@ def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Ten
         Three tensors (P(P−1)/2,), in the order of `torch.triu_indices`. The first two are 0 for coinciding points.
     """
     i, j = torch.triu_indices(len(points), len(points), 1, device=points.device)
-    first, second, among = _cosines((points, directions), (points, directions))[:, i, j]
+    oriented = (points, directions)
+    first, second, among = _cosines(oriented, oriented)[:, i, j]
     return first, second, among
 
 
 def _distances(rows: Inputs, columns: Inputs) -> Tensor:
-    centre = rows[0].detach().mean(dim=-2, keepdim=True)  # preserves digits in the squares
-    x = rows[0] - centre
-    y = columns[0] - centre
-    squares = (
-        x.square().sum(dim=-1).unsqueeze(-1) + y.square().sum(dim=-1).unsqueeze(-2) - 2 * x @ y.mT
-    )
-    # At 0 the square root has no derivative, so coinciding points get a derivative of 0.
-    return torch.where(squares > 0, torch.where(squares > 0, squares, 1).sqrt(), 0).unsqueeze(-3)
+    x, y = _centred(rows[0], columns[0])
+    x_squares = x.square().sum(dim=-1).unsqueeze(-1)
+    y_squares = y.square().sum(dim=-1).unsqueeze(-2)
+    squares = x_squares + y_squares - 2 * x @ y.mT
+    return _where_apart(squares, torch.sqrt).unsqueeze(-3)
 
 
 def _cosines(rows: Inputs, columns: Inputs) -> Tensor:
-    factors = zip(cosine_factors(*rows), cosine_factors(*columns), strict=True)
-    *products, among = (left @ right.mT for (left, _), (_, right) in factors)
+    along_row, along_column, among = cosine_products(rows, columns)
     inverse = _inverse_distances(rows[0], columns[0])
-    by_row, by_column = ((x * inverse).clamp(-1, 1) for x in products)
-    return torch.stack(
-        [torch.maximum(by_row, by_column), torch.minimum(by_row, by_column), among], dim=-3
-    )
+    by_row = (along_row * inverse).clamp(-1, 1)
+    by_column = (along_column * inverse).clamp(-1, 1)
+    larger = torch.maximum(by_row, by_column)
+    smaller = torch.minimum(by_row, by_column)
+    return torch.stack([larger, smaller, among], dim=-3)
 
 
 def _twists(rows: Inputs, columns: Inputs) -> Tensor:
-    centre = rows[0].detach().mean(dim=-2, keepdim=True)
-    (p, m), (q, n) = (rows[0] - centre, rows[1]), (columns[0] - centre, columns[1])
+    p, q = _centred(rows[0], columns[0])
+    m = rows[1]
+    n = columns[1]
     # (m × n)·(q − p) = m·(n × q) − (p × m)·n, which are matrix products
     triple = m @ torch.linalg.cross(n, q).mT - torch.linalg.cross(p, m) @ n.mT
-    return (triple * _inverse_distances(p, q)).clamp(-1, 1).unsqueeze(-3)
+    twists = triple * _inverse_distances(p, q)
+    return twists.clamp(-1, 1).unsqueeze(-3)
+
+
+def _centred(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Return points of rows and of columns relative to the mean of those of rows, which preserves digits in squares."""
+    centre = x.detach().mean(dim=-2, keepdim=True)
+    return x - centre, y - centre
 
 
 def _inverse_distances(x: Tensor, y: Tensor) -> Tensor:
@@ -148,15 +155,25 @@ def _inverse_distances(x: Tensor, y: Tensor) -> Tensor:
     if x.shape[-1] > 3:  # coordinate by coordinate would be slow
         squares = torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist").square()
     else:
-        coordinates = zip(x.unbind(-1), y.unbind(-1), strict=True)
-        squares = sum(
-            ((a.unsqueeze(-1) - b.unsqueeze(-2)).square() for a, b in coordinates), x.new_zeros(())
-        )
-    return torch.where(squares > 0, torch.where(squares > 0, squares, 1).rsqrt(), 0)
+        squares = x.new_zeros(())
+        for a, b in zip(x.unbind(-1), y.unbind(-1), strict=True):
+            difference = a.unsqueeze(-1) - b.unsqueeze(-2)
+            squares = squares + difference.square()
+    return _where_apart(squares, torch.rsqrt)
 
 
-_EMPTY = [torch.empty(0, device="cpu")] * 4
-TEMPLATES = (euclidean_distances(*_EMPTY[:2]), oriented_pairs(*_EMPTY), pair_twists(*_EMPTY[:3]))
+def _where_apart(squares: Tensor, root: Callable[[Tensor], Tensor]) -> Tensor:
+    """Return a root of squared distances; 0 for coinciding points, and its derivative, which no root has there."""
+    is_apart = squares > 0
+    return torch.where(is_apart, root(torch.where(is_apart, squares, 1)), 0)
+
+
+_EMPTY = torch.empty(0, device="cpu")
+TEMPLATES = (
+    euclidean_distances(_EMPTY, _EMPTY),
+    oriented_pairs(_EMPTY, _EMPTY, _EMPTY, _EMPTY),
+    pair_twists(_EMPTY, _EMPTY, _EMPTY),
+)
 """All values that this module defines, with empty tensors, for `with_tensors`."""
 
 
@@ -168,14 +185,12 @@ def centres_of(pairs: Sequence[PairValues]) -> list[Tensor]:
 def with_tensors(pairs: Sequence[PairValues], tensors: Sequence[Tensor]) -> list[PairValues]:
     """Return the values with their inputs and centres replaced by tensors, in order."""
     remaining = iter(tensors)
-    return [
-        replace(
-            p,
-            inputs=tuple(next(remaining) for _ in p.inputs),
-            centres=tuple(next(remaining) for _ in p.centres),
-        )
-        for p in pairs
-    ]
+    replaced = []
+    for pair in pairs:
+        inputs = tuple(next(remaining) for _ in pair.inputs)
+        centres = tuple(next(remaining) for _ in pair.centres)
+        replaced.append(replace(pair, inputs=inputs, centres=centres))
+    return replaced
 
 
 def find_intervals(values: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
@@ -185,15 +200,19 @@ def find_intervals(values: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
     differentiable in both arguments.
     """
     # A copy of the boundaries, as up to PyTorch 2.11 code compiled for a GPU ignores the offset of a view.
-    below = torch.bucketize(
-        values.detach().contiguous(), centres.detach()[1:-1].clone(), right=True
-    )
-    # Not centres[below], whose gradient on a GPU adds all contributions to a centre sequentially.
-    rows = torch.atleast_2d(below).flatten(0, -2)
-    start, end = (
-        centres.expand(rows.shape[0], -1).gather(1, i).view_as(values) for i in (rows, rows + 1)
-    )
-    return below, ((values - start) / (end - start)).clamp(0, 1)
+    boundaries = centres.detach()[1:-1].clone()
+    below = torch.bucketize(values.detach().contiguous(), boundaries, right=True)
+    start = _centres_at(centres, below)
+    end = _centres_at(centres, below + 1)
+    position = (values - start) / (end - start)
+    return below, position.clamp(0, 1)
+
+
+def _centres_at(centres: Tensor, indices: Tensor) -> Tensor:
+    # Not centres[indices], whose gradient on a GPU adds all contributions to a centre sequentially.
+    rows = torch.atleast_2d(indices).flatten(0, -2)
+    in_each_row = centres.expand(rows.shape[0], -1)
+    return in_each_row.gather(1, rows).view_as(indices)
 
 
 def count_by_torch(
@@ -205,22 +224,21 @@ def count_by_torch(
     *tensors: Tensor,
 ) -> Tensor:
     """Return float64 counts (N, C(C+1)/2, B, ...), see `count_pairs`."""
-    # Padding may hold infinity, and 0 times infinity is NaN.
-    clean = [
-        t.masked_fill(~mask.view(*mask.shape, *[1] * (t.ndim - 2)), 0) if t.ndim > 1 else t
-        for t in tensors
-    ]
-    weights = weights.masked_fill(~mask[:, :, None], 0)
+    clean = [_without_padding(tensor, mask) for tensor in tensors]
+    weights = _without_padding(weights, mask)
     n_shapes, n_points, n_members = classes.shape
     bins = [len(centres) for centres in centres_of(pairs)]
     n_cells = n_classes * math.prod(bins)
-    total = torch.zeros(n_shapes, n_classes, n_cells, dtype=torch.float64, device=classes.device)
-    n_rows = n_points
-    firsts = range(1)
-    # A program for any number of shapes or points has one block, as a number of blocks would be fixed by tracing.
-    if not any(isinstance(n, torch.SymInt) for n in (n_shapes, n_points)):
-        n_rows = max(1, _BLOCK // (n_shapes * max(n_cells, n_points * n_members * 2 ** len(bins))))
+    if isinstance(n_shapes, torch.SymInt) or isinstance(n_points, torch.SymInt):
+        # A program for any number of shapes or points has one block, as tracing would fix the number of blocks.
+        n_rows = n_points
+        firsts = range(1)
+    else:
+        n_corners = n_points * n_members * 2 ** len(bins)
+        row_size = n_shapes * max(n_cells, n_corners)
+        n_rows = max(1, _BLOCK // row_size)
         firsts = range(0, n_points - 1, n_rows)
+    total = torch.zeros(n_shapes, n_classes, n_cells, dtype=torch.float64, device=classes.device)
     for first in firsts:
         task = partial(_count_rows, first, first + n_rows, classes, n_classes, pairs)
         # The gradient computes the values of pairs again, as storing them takes much more memory than the points.
@@ -231,7 +249,16 @@ def count_by_torch(
     total = total.view(n_shapes, n_classes, n_classes, *bins)
     total = total + total.transpose(1, 2)
     a, b = torch.triu_indices(n_classes, n_classes, device=classes.device)
-    return total[:, a, b] * torch.where(a == b, 0.5, 1.0).view(-1, *[1] * len(bins))
+    # The sum with its transpose counts pairs of one class twice
+    factors = torch.where(a == b, 0.5, 1.0)
+    return total[:, a, b] * factors.view(-1, *[1] * len(bins))
+
+
+def _without_padding(tensor: Tensor, mask: Tensor) -> Tensor:
+    """Return a tensor (N, P, ...) with 0 in place of padding, which may hold infinity: 0 times infinity is NaN."""
+    if tensor.ndim == 1:  # centres
+        return tensor
+    return tensor.masked_fill(with_axes_of(~mask, tensor), 0)
 
 
 def _count_rows(
@@ -245,35 +272,35 @@ def _count_rows(
 ) -> Tensor:
     """Return counts (N, C, C·cells), by both classes, of pairs of the points [first, end) with later points."""
     pairs = with_tensors(pairs, others)
-    bins = [len(centres) for centres in centres_of(pairs)]
+    values = []
     with full_precision():
-        values = [
-            p.between([x[:, first:end] for x in p.inputs], [x[:, first:] for x in p.inputs])
-            for p in pairs
-        ]
+        for pair in pairs:
+            rows = [x[:, first:end] for x in pair.inputs]
+            columns = [x[:, first:] for x in pair.inputs]
+            values.append(pair.between(rows, columns))
     # Each row is first counted separately, by the class of the column's point only, as this adds fewer numbers, and few
     # to the same cell. Indices and weights are (N, I, J, M), finally (N, I, J, M·2^K), for the corners of each cell.
+    centres = centres_of(pairs)
     index = classes[:, None, first:]
-    # Pairs of a point with itself or with an earlier point have weight 0.
-    weight = weights[:, None, first:] * torch.ones_like(values[0][0, 0]).triu(1).unsqueeze(2)
     shares = []
-    for value, centres in zip(torch.cat(values, dim=1).unbind(1), centres_of(pairs), strict=True):
-        below, share = find_intervals(value, centres)
+    for value, its_centres in zip(torch.cat(values, dim=1).unbind(1), centres, strict=True):
+        below, share = find_intervals(value, its_centres)
         shares.append(share)
-        index = index * len(centres) + below.unsqueeze(3)
-    stride = math.prod(bins)
-    for share, n_bins in zip(shares, bins, strict=True):
-        stride //= n_bins
+        index = index * len(its_centres) + below.unsqueeze(3)
+    # Pairs of a point with itself or with an earlier point have weight 0.
+    is_later = torch.ones_like(values[0][0, 0]).triu(1)
+    weight = weights[:, None, first:] * is_later.unsqueeze(2)
+    n_cells = math.prod(len(x) for x in centres)
+    stride = n_cells
+    for share, its_centres in zip(shares, centres, strict=True):
+        stride //= len(its_centres)
         upper = weight * share.unsqueeze(3)
         # Not weight·(1 − share), nor a difference of sums, as rounding could make them negative.
         weight = torch.cat([weight - upper, upper], dim=3)
         index = torch.cat([index, index + stride], dim=3)
     own = weights[:, first:end].double()
-    n_cells = n_classes * math.prod(bins)
-    rows = own.new_zeros(*own.shape[:2], n_cells).scatter_add(
-        2, index.flatten(2), weight.double().flatten(2)
-    )
-    memberships = own.new_zeros(*own.shape[:2], n_classes).scatter_add(
-        2, classes[:, first:end], own
-    )
-    return memberships.mT @ rows
+    counts = own.new_zeros(*own.shape[:2], n_classes * n_cells)
+    counts = counts.scatter_add(2, index.flatten(2), weight.double().flatten(2))
+    memberships = own.new_zeros(*own.shape[:2], n_classes)
+    memberships = memberships.scatter_add(2, classes[:, first:end], own)
+    return memberships.mT @ counts

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from igps._parameters import check_at_least, check_fraction, check_positive
+from igps._tensors import above_zero
 from igps.nn.heads.base import (
     Head,
     check_cells,
@@ -96,23 +97,22 @@ class WhitenedHead(Head):
         members = class_members(roots, labels)
         means = class_means(roots, members)
         self.centre(descriptions, part_cells)
-        residuals = self.parts((roots - means[members]).double())
+        residuals = (roots - means[members]).double()
+        rank = len(roots) - len(means)  # the largest that residuals can have
         for part, directions, gains in zip(
-            residuals, self.parts(self.directions), self.gains, strict=True
+            self.parts(residuals), self.parts(self.directions), self.gains, strict=True
         ):
-            # The maximum for residuals of N shapes in C classes: N − C
-            rank = len(roots) - len(means)
             own_directions, own_gains = within_class_whitening(
                 part, rank, self.shrinkage, self.n_directions
             )
             directions[: len(own_directions)] = own_directions
             gains[: len(own_gains)] = own_gains
         if self.prior is not None and len(means) > 1:
-            discriminants = torch.stack(
-                [_discriminant(part, members) for part in self.whitened_parts(roots)]
-            )
-            if discriminants.sum() > 0:
-                self.part_shares = discriminants / discriminants.sum()
+            parts = self.whitened_parts(roots)
+            discriminants = torch.stack([_discriminant(part, members) for part in parts])
+            total = discriminants.sum()
+            if total > 0:
+                self.part_shares = discriminants / total
         return self
 
     @torch.no_grad()
@@ -139,8 +139,9 @@ class WhitenedHead(Head):
             own = functional.normalize(roots, dim=1)
         if self.prior is None:
             return own
-        share = self.prior_share
-        return torch.cat([(1 - share).sqrt() * own, share.sqrt() * self.prior(descriptions)], dim=1)
+        own_length = (1 - self.prior_share).sqrt()
+        prior_length = self.prior_share.sqrt()
+        return torch.cat([own_length * own, prior_length * self.prior(descriptions)], dim=1)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """Return cosine distances (Q, G) of embeddings (Q, D) and (G, D), or their weighted mean with the prior's."""
@@ -251,8 +252,8 @@ class KernelHead(Head):
         self.shares = self.anchors.new_tensor([*of_parts, *of_prior])
         distances = self._distances(self.anchors)
         is_pair = torch.ones_like(distances[0], dtype=torch.bool).triu(1)
-        distances = distances[:, is_pair]
-        self.medians = distances.median(dim=1).values.clamp_min(torch.finfo(distances.dtype).tiny)
+        medians = distances[:, is_pair].median(dim=1).values
+        self.medians = above_zero(medians)
         values, vectors = torch.linalg.eigh(self._kernel(self.anchors).double())
         factors = torch.where(values > 0, 1 / (values + self.ridge), 0)
         targets = functional.one_hot(members, len(self.classes)).double()
@@ -296,11 +297,13 @@ class KernelHead(Head):
     def _distances(self, vectors: Tensor) -> Tensor:
         """Return distances (kernels, N, n_shapes) to the training shapes: cosine for each part, then the prior's."""
         sizes = self.whitened._noted["part_cells"]
-        both = (vectors, self.anchors.to(vectors.dtype))
-        parts, anchors = (x.split([*sizes, x.shape[1] - sum(sizes)], dim=1) for x in both)
-        distances = [1 - parts[k] @ anchors[k].T for k in range(len(sizes))]
+        n_prior = vectors.shape[1] - sum(sizes)
+        *parts, by_prior = vectors.split([*sizes, n_prior], dim=1)
+        anchors = self.anchors.to(vectors.dtype)
+        *anchor_parts, anchors_by_prior = anchors.split([*sizes, n_prior], dim=1)
+        distances = [1 - part @ own.T for part, own in zip(parts, anchor_parts, strict=True)]
         if self.prior is not None:
-            distances.append(self.prior.distances(parts[-1], anchors[-1]))
+            distances.append(self.prior.distances(by_prior, anchors_by_prior))
         return torch.stack(distances)
 
 
@@ -311,4 +314,5 @@ def _discriminant(vectors: Tensor, members: Tensor) -> Tensor:
     between = distances[~is_same]
     within = distances[is_same.fill_diagonal_(False)]
     variance = within.var(correction=0) + between.var(correction=0)
-    return ((between.mean() - within.mean()) / variance.clamp_min(_MIN_VARIANCE)).clamp_min(0)
+    difference = between.mean() - within.mean()
+    return (difference / variance.clamp_min(_MIN_VARIANCE)).clamp_min(0)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from igps._parameters import check_at_least
+from igps._tensors import above_zero
 from igps.nn.heads.base import Head, check_cells, square_roots
 from igps.retrieval.distances import chi_square
 
@@ -55,7 +56,7 @@ class ProjectionHead(Head):
             )
         self.mean = roots.mean(dim=0)
         # One scale for all cells, as a scale for each would amplify the cells that are nearly always empty.
-        self.scale.copy_(roots.std(dim=0).mean().clamp_min(torch.finfo(roots.dtype).tiny))
+        self.scale.copy_(above_zero(roots.std(dim=0).mean()))
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
@@ -95,13 +96,9 @@ class BlendedDistance(nn.Module):
         """Fit the units to the descriptions (N, ...) of the training shapes, after the head is trained."""
         if self.head is None:
             return
-        pairs = tuple(torch.triu_indices(len(descriptions), len(descriptions), 1))
         embedding = self.head(descriptions)
-        for unit, distances in (
-            (self.plain_unit, chi_square(descriptions, descriptions)),
-            (self.learned_unit, self.head.distances(embedding, embedding)),
-        ):
-            unit.copy_(distances[pairs].median().clamp_min(torch.finfo(distances.dtype).tiny))
+        self.plain_unit.copy_(_median(chi_square(descriptions, descriptions)))
+        self.learned_unit.copy_(_median(self.head.distances(embedding, embedding)))
 
     def forward(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """Return distances (Q, G) between descriptions (Q, ...) and (G, ...)."""
@@ -109,4 +106,12 @@ class BlendedDistance(nn.Module):
         if self.head is None:
             return plain
         learned = self.head.distances(self.head(queries), self.head(gallery))
-        return (1 - self.share) * plain / self.plain_unit + self.share * learned / self.learned_unit
+        plain_share = (1 - self.share) * plain / self.plain_unit
+        return plain_share + self.share * learned / self.learned_unit
+
+
+def _median(distances: Tensor) -> Tensor:
+    """Return the median of the distances (N, N) between different shapes, which is not 0."""
+    n = len(distances)
+    i, j = torch.triu_indices(n, n, 1)
+    return above_zero(distances[i, j].median())

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from igps._parameters import check_at_least, check_positive
+from igps._tensors import above_zero
 from igps.nn.heads.base import (
     Head,
     check_cells,
@@ -88,8 +89,9 @@ class WCCNHead(Head):
             own_directions = self._directions(part.double(), members)
             directions[: len(own_directions)] = own_directions
             if self.lengths:
-                vectors = part[:: max(1, len(part) // _N_MEDIAN_SHAPES)] @ directions.T
-                median = torch.pdist(vectors).median().clamp_min(torch.finfo(vectors.dtype).tiny)
+                step = max(1, len(part) // _N_MEDIAN_SHAPES)
+                distances = torch.pdist(part[::step] @ directions.T)
+                median = above_zero(distances.median())
                 directions *= MEDIAN / (median * math.sqrt(len(self._sizes())))
         return self
 
@@ -106,7 +108,8 @@ class WCCNHead(Head):
             return functional.normalize(torch.cat(projected, dim=1), dim=1)
         vectors = torch.cat(projected, dim=1)
         # Shapes farther from the mean than any training shape are moved onto the sphere.
-        vectors = vectors / torch.linalg.norm(vectors, dim=1, keepdim=True).clamp_min(1)
+        lengths = torch.linalg.norm(vectors, dim=1, keepdim=True)
+        vectors = vectors / lengths.clamp_min(1)
         height = (1 - vectors.square().sum(dim=1, keepdim=True)).clamp_min(0)
         return torch.cat([vectors, square_root(height)], dim=1)
 
@@ -140,13 +143,9 @@ class WCCNHead(Head):
         """Return the centred cells (N, cells) and the directions (n_directions, cells) of each used part."""
         sizes = self._sizes()
         centred = used - self.mean
-        return list(
-            zip(
-                centred.split(sizes, 1),
-                self.directions.to(centred.dtype).split(sizes, 1),
-                strict=True,
-            )
-        )
+        directions = self.directions.to(centred.dtype)
+        parts = zip(centred.split(sizes, 1), directions.split(sizes, 1), strict=True)
+        return list(parts)
 
     def _select_parts(self, roots: Tensor) -> Tensor:
         """Return the cells (N, cells) of all used parts."""

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from igps._tensors import with_axes_of
 from igps.nn.axes.points import PointAxis
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
@@ -59,8 +60,8 @@ class PointHistogram(AxesHistogram):
         for axis in self.point_axes:
             values = axis.values(features, self.embedding)
             # Padding may hold NaN, which `memberships` refuses.
-            is_real = mask.view(*mask.shape, *[1] * (values.ndim - 2))
-            memberships.append(axis.memberships(torch.where(is_real, values, 0)))
+            known = torch.where(with_axes_of(mask, values), values, 0)
+            memberships.append(axis.memberships(known))
         return point_histogram(memberships, mask, features.weights())
 
 
