@@ -40,6 +40,16 @@ def test_a_bar_without_progress_prints_nothing():
     assert text.getvalue() == ""
 
 
+def test_in_a_file_a_warning_is_a_line_and_does_not_repeat_the_bar():
+    text = StringIO()
+    with Progress(total=2, desc="bodies", file=text) as bar:
+        for _ in range(2):
+            Progress.write("WARNING: skipped", file=text)
+            bar.update()
+    warnings = ["WARNING: skipped"] * 2
+    assert text.getvalue().splitlines() == [*warnings, "bodies: 2/2 [00:00<00:00]"]
+
+
 def test_in_a_file_a_bar_is_a_line_a_minute_and_one_at_its_end(clock):
     text = StringIO()
     with Progress(total=10, desc="bodies", file=text) as bar:

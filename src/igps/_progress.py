@@ -52,6 +52,16 @@ class Progress(tqdm):
 
         return write_line
 
+    @classmethod
+    def write(cls, s: str, file: Any = None, end: str = "\n", nolock: bool = False) -> None:
+        """Write a line above the bars of a terminal; in a file, the last line of a bar stays as it is."""
+        stream = file or sys.stdout
+        if stream.isatty():
+            super().write(s, stream, end, nolock)
+            return
+        stream.write(s + end)
+        stream.flush()
+
     def update(self, n: float | None = 1) -> bool | None:
         """Add n results; the clock of the estimate starts at the first."""
         if not self._is_first:

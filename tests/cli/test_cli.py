@@ -682,7 +682,7 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         ),
         (
             ["explain", "BALL"],
-            "meshes: expected two files, or a folder of two groups, got 1 files.",
+            "meshes: expected two files, or a folder of two groups, got 1 file.",
         ),
         (
             ["explain", "BALL", "BALL", "BALL"],

@@ -160,10 +160,20 @@ def test_further_columns_stay_with_their_bodies(root, tmp_path):
         ValueError, match=r"weight: no such column of labels\.csv; further columns: age, scanner"
     ):
         bodies.column("weight")
+    (root / "labels.csv").unlink()
+    with pytest.raises(ValueError, match=r"weight: .*further columns: none\. Add it"):
+        find_bodies(root).column("weight")
     with pytest.raises(ValueError, match=r"scanner: expected numbers, got 'A' of 2\.obj#spleen"):
         bodies.subset([0]).numbers("scanner")
     dataset = SignatureDataset(bodies, CONFIG, tmp_path / "cache", reading=OBJECTS)
     assert dataset[["1.obj#spleen", "2.obj#spleen"]].bodies.columns["age"] == ("41.5", "30")
+
+
+def test_a_folder_in_the_table_is_refused_with_its_line(root):
+    (root / "s1").mkdir()
+    (root / "labels.csv").write_text("file,label\n1.obj,well\ns1,ill\n")
+    with pytest.raises(ValueError, match=r"labels\.csv: line 3 names the folder s1\. Give a line"):
+        find_bodies(root)
 
 
 def test_a_session_is_no_number(root):

@@ -84,3 +84,9 @@ def test_splits_depend_on_the_seed_alone():
 def test_impossible_splits_are_refused(split, arguments, message):
     with pytest.raises(ValueError, match=message):
         split(LABELS, **arguments)
+
+
+def test_a_share_of_a_class_of_four_is_refused_by_its_class():
+    labels = torch.tensor([0] * 6 + [1] * 4)
+    with pytest.raises(ValueError, match="at least 5 shapes of a class, got 4 of class 1"):
+        split_seen(labels, 0.5)

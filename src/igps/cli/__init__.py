@@ -67,11 +67,11 @@ def main() -> None:
             check_place("failures", options.get("failures"), ())
         from tqdm.contrib.logging import logging_redirect_tqdm  # a warning clears the bar first
 
-        from igps._progress import number_bars
+        from igps._progress import Progress, number_bars
 
         # With --json, standard output holds the JSON alone
         place = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()
-        with place, logging_redirect_tqdm(), _threads_of(command):
+        with place, logging_redirect_tqdm(tqdm_class=Progress), _threads_of(command):
             result = command.function(**options)
             number_bars(None)
         verdict = result if isinstance(result, Verdict) else Verdict(result, True)

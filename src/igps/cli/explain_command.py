@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from igps._parameters import check_fraction
+from igps._text import counted
 
 if TYPE_CHECKING:
     from igps.analysis.explanation import Explanation, Shares
@@ -110,7 +111,7 @@ def _check_files(files: Sequence[Path], *of_folders: object) -> None:
 
     if len(files) != 2:
         raise ValueError(
-            f"meshes: expected two files, or a folder of two groups, got {len(files)} files."
+            f"meshes: expected two files, or a folder of two groups, got {counted(len(files), 'file')}."
         )
     if any(option is not None for option in of_folders):
         raise ValueError(

@@ -85,9 +85,10 @@ class Bodies:
     def column(self, name: str) -> tuple[str, ...]:
         """Return the values of a column such as "scanner"; raise a ValueError if a body has no value."""
         if name not in self.columns:
-            names = ", ".join(self.columns) or "none"
+            names = ", ".join(self.columns)
+            remedy = "Choose one of them" if names else "Add it, in a line for each file"
             raise ValueError(
-                f"{name}: no such column of {LABELS_FILE}; further columns: {names}. Choose one of them."
+                f"{name}: no such column of {LABELS_FILE}; further columns: {names or 'none'}. {remedy}."
             )
         values = self.columns[name]
         missing = [body for body, value in zip(self.names, values, strict=True) if value is None]
@@ -161,9 +162,8 @@ def find_bodies(
     if not _is_utf8(root.absolute()):
         raise ValueError(f"{os.fsencode(root)!r}: expected a name in UTF-8. Rename the folder.")
     if not root.is_dir():
-        raise FileNotFoundError(
-            f"{root}: {'expected a folder, got a file' if root.exists() else 'no such folder'}."
-        )
+        fault = "expected a folder, got a file" if root.exists() else "no such folder"
+        raise FileNotFoundError(f"{root}: {fault}. Check the path.")
     has_table = (root / LABELS_FILE).is_file()
     bodies = (
         _from_labels_file(root, listing) if has_table else _from_folder(root, listing, attributes)
@@ -334,6 +334,10 @@ def _from_labels_file(root: Path, listing: Listing) -> Bodies:
             raise ValueError(f"{file}: {cause}. Each line names a file and its class.")
         further = {name: _known_value(values[name]) for name in further_columns}
         name = values["file"]
+        if (root / name).is_dir():
+            raise ValueError(
+                f"{file}: line {number} names the folder {name}. Give a line for each file in it."
+            )
         part = values.get("body") or None
         rows.append(_Row(root / name, name, values.get("label"), part, further))
     if not rows:

@@ -74,7 +74,8 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
         n_fit = _count(n_train, len(members), 3, 2)
         if 0 < n_train < 1 and len(members) < 5:
             raise ValueError(
-                f"n_train: a share expects at least 5 shapes of a class, got {len(members)} of {label}."
+                f"n_train: a share expects at least 5 shapes of a class, got {len(members)} of class {label}. "
+                "Give a number of shapes, or leave the class out."
             )
         if len(members) <= n_fit:
             raise ValueError(

@@ -117,6 +117,8 @@ def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
     modules: list[nn.Module] = []
 
     def build(spec: Mapping[str, Any]) -> nn.Module:
+        if not isinstance(spec, Mapping) or not {"class_path", "same_as"} & set(spec):
+            raise ValueError("a descriptor has the keys class_path and init_args")
         if set(spec) == {"same_as"}:
             return modules[spec["same_as"]]
         path = spec["class_path"]
