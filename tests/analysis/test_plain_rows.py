@@ -37,6 +37,9 @@ def test_size_alone_tells_small_balls_from_large_ones_and_the_table_says_so(tmp_
     table = plain_table(rows, "pretrained", rows["measures"])
     assert "measures+size  100.0  100.0  100.0" in table
     assert "measures, measures+size find these classes as well as pretrained or better" in table
+    sized = {"measures+size": rows["measures+size"]}
+    table = plain_table(sized, "pretrained", rows["measures"])
+    assert "measures+size finds these classes" in table
 
 
 def test_molecules_have_rows_of_composition_and_length(tmp_path):

@@ -118,8 +118,9 @@ def plain_table(rows: Mapping[str, RetrievalScores], descriptor: str, own: Retri
     first_tier = own.mean()["ft"]
     ahead = [name for name, mean in means.items() if mean["ft"] >= first_tier]
     if ahead:
+        verb = "finds" if len(ahead) == 1 else "find"
         lines.append(
-            f"{', '.join(ahead)} find these classes as well as {descriptor} or better: the classes differ in plain "
+            f"{', '.join(ahead)} {verb} these classes as well as {descriptor} or better: the classes differ in plain "
             "numbers, and the result says little about form"
         )
     return "\n".join(lines)
