@@ -334,7 +334,7 @@ def _from_labels_file(root: Path, listing: Listing) -> Bodies:
             raise ValueError(f"{file}: {cause}. Each line names a file and its class.")
         further = {name: _known_value(values[name]) for name in further_columns}
         name = values["file"]
-        if (root / name).is_dir():
+        if os.path.isdir(root / name):
             raise ValueError(
                 f"{file}: line {number} names the folder {name}. Give a line for each file in it."
             )
