@@ -12,7 +12,7 @@ from trimesh.creation import icosphere
 from igps.mesh.denoising import Neighbours, is_noisy, noise_and_edge, remove_noise
 from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import area_vectors
+from igps.mesh.surface import area_vectors, undirected_edges
 from igps.shapes import ArticulatedShapes
 
 
@@ -241,7 +241,9 @@ def test_a_knurled_knob_is_no_noise():
 
 
 def _noise_over_edge(vertices, faces):
-    noise, edge = noise_and_edge(vertices, faces, Neighbours.of(vertices, faces))
+    edges, _ = undirected_edges(faces)
+    around = Neighbours.of(vertices, edges)
+    noise, edge = noise_and_edge(vertices, faces, around)
     return noise / edge
 
 

@@ -77,18 +77,20 @@ class OrientedSurface:
             return np.zeros(len(points))
         import igl
 
-        # The fast method is off by a tenth near triangles that are much longer than wide.
-        is_exact = len(points) * len(self.faces) <= _MAX_EXACT_PAIRS
-        number = igl.winding_number if is_exact else igl.fast_winding_number
-        return np.asarray(number(self.vertices, self.faces, points.astype(np.float64)))
+        method = igl.winding_number
+        if len(points) * len(self.faces) > _MAX_EXACT_PAIRS:
+            # It is off by a tenth near triangles that are much longer than wide.
+            method = igl.fast_winding_number
+        points = points.astype(np.float64)
+        return np.asarray(method(self.vertices, self.faces, points))
 
 
 def _probe_points(vertices: Floats, faces: Integers) -> Floats:
     """Return points on the outer, then on the inner side of the centroids of faces chosen evenly by area."""
     normals = area_vectors(vertices, faces)
     areas = lengths(normals)
-    at = (np.arange(_N_PROBES) + 0.5) / _N_PROBES * areas.sum()
-    chosen = np.searchsorted(np.cumsum(areas), at)
+    shares = (np.arange(_N_PROBES) + 0.5) / _N_PROBES
+    chosen = np.searchsorted(np.cumsum(areas), shares * areas.sum())
     chosen = np.minimum(chosen, len(areas) - 1)
     chosen = chosen[areas[chosen] > 0]
     middle = vertices[faces[chosen]].mean(axis=1)
@@ -127,18 +129,18 @@ def _outside_by_winding(
     if not len(leaked):
         return outside, 0
     # Check every flooded point near the leaks.
-    low = np.maximum(leaked.min(axis=0) - 4, 0)
-    high = np.minimum(leaked.max(axis=0) + 5, outside.shape)
+    low = leaked.min(axis=0) - 4
+    high = leaked.max(axis=0) + 5
+    # Where a base is missing, winding numbers are large beyond the bounding box, too, but no body reaches there.
+    low = np.maximum(low, MARGIN)
+    high = np.minimum(high, np.array(outside.shape) - MARGIN)
     box = tuple(map(slice, low, high))
     points = np.argwhere(outside[box]) + low
-    # Where a base is missing, winding numbers are large beyond the bounding box, too, but no body reaches there.
-    end = np.array(outside.shape) - MARGIN
-    is_in_box = ((points >= MARGIN) & (points < end)).all(axis=1)
-    points = points[is_in_box]
     points = points[surface.winding(points) > 0.5]
     inside = np.zeros_like(outside)
     inside[tuple(points.T)] = True
-    _, count = ndimage.label(inside, structure=np.ones((3, 3, 3)))
+    touching = np.ones((3, 3, 3))
+    _, count = ndimage.label(inside, structure=touching)
     return outside & ~inside, count
 
 
@@ -159,7 +161,8 @@ def _cavities(outside: Booleans, surface: OrientedSurface) -> Booleans:
 def _closed_spaces(depth: Floats, radius: float) -> Iterator[tuple[Booleans, float]]:
     """Yield the cores deeper than the radius, and the depth, of spaces that no mouth of this radius opens."""
     # Everything around the grid is outside.
-    label, count = ndimage.label(np.pad(depth > radius, 1, constant_values=True))
+    is_deep = np.pad(depth > radius, 1, constant_values=True)
+    label, count = ndimage.label(is_deep)
     if count == 1:
         return
     open_label = label[0, 0, 0]

@@ -53,8 +53,9 @@ def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     without_cracks = _close_cracks(vertices, place[faces])
     place = without_cracks[place]
     n_places = len(np.unique(place))
-    if n_places < len(vertices):
-        notes.append(f"welded {counted(len(vertices) - n_places, 'coincident vertex')}")
+    n_coincident = len(vertices) - n_places
+    if n_coincident:
+        notes.append(f"welded {counted(n_coincident, 'coincident vertex')}")
         faces = place[faces]
     is_degenerate = has_twins(faces)
     if is_degenerate.any():
@@ -62,8 +63,9 @@ def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
         faces = faces[~is_degenerate]
     sorted_corners = np.sort(faces, axis=1)
     _, first = np.unique(sorted_corners, axis=0, return_index=True)
-    if len(first) < len(faces):
-        notes.append(f"dropped {counted(len(faces) - len(first), 'duplicate face')}")
+    n_duplicate = len(faces) - len(first)
+    if n_duplicate:
+        notes.append(f"dropped {counted(n_duplicate, 'duplicate face')}")
         faces = faces[np.sort(first)]
     n_unused += n_places - len(np.unique(faces))
     if n_unused:
@@ -74,9 +76,9 @@ def weld(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
 
 def places(vertices: Floats) -> Integers:
     """Return, for each vertex (V,), the index of the first vertex at the same place, up to a tolerance."""
-    size = max(diagonal(vertices), TINY)
+    tolerance = _WELD * max(diagonal(vertices), TINY)
     centred = vertices - vertices.mean(axis=0)
-    lattice = np.round(centred / (_WELD * size)).astype(np.int64)
+    lattice = np.round(centred / tolerance).astype(np.int64)
     _, first, index = np.unique(lattice, axis=0, return_index=True, return_inverse=True)
     return np.asarray(first[index.ravel()])
 
@@ -119,7 +121,8 @@ def orient(faces: Integers, notes: list[str]) -> Integers:
     is_reversed ^= is_mostly_reversed[part]
     if is_reversed.any():
         notes.append(f"turned {counted(int(is_reversed.sum()), 'face')} to orient the surface")
-        faces = np.where(is_reversed[:, None], faces[:, ::-1], faces)
+        faces = faces.copy()
+        faces[is_reversed] = faces[is_reversed, ::-1]
     return faces
 
 
@@ -320,7 +323,8 @@ def _span(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
 
 def _circle(turns: Floats, radius: float) -> Floats:
     angles = 2 * np.pi * turns
-    return radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    circle = [np.cos(angles), np.sin(angles)]
+    return radius * np.stack(circle, axis=1)
 
 
 def _solve_umbrella(fixed: Floats, faces: Integers, n_points: int, order: int) -> Floats:

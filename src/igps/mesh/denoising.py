@@ -81,9 +81,11 @@ def is_noisy(vertices: Floats, faces: Integers) -> bool:
     if len(vertices) < _MIN_VERTICES:
         return False
     vertices = vertices / _unit_of_length(vertices)
-    around = Neighbours.of(vertices, faces)
-    if (around.faces_at_sides == 2).mean() < _MIN_REGULAR:
+    edges, edge_of = undirected_edges(faces)
+    n_faces = np.bincount(edge_of)
+    if (n_faces[edge_of] == 2).mean() < _MIN_REGULAR:
         return False
+    around = Neighbours.of(vertices, edges)
     averaging = around.averaging
     # Normals of the averaged surface, because noise larger than the triangles makes their own normals useless.
     once = averaging @ vertices
@@ -93,51 +95,47 @@ def is_noisy(vertices: Floats, faces: Integers) -> bool:
     residual = (height - averaging @ height) / length
     if np.quantile(np.abs(residual), 0.25) <= _MIN_ROUGHNESS:
         return False
-    start, end = around.edges.T
+    start, end = edges.T
     weights = averaging[start, end] + averaging[end, start]
     has_same_sign = residual[start] * residual[end] > 0
     if np.average(has_same_sign, weights=weights) >= _MAX_SAME_SIGN:
         return False
-    return _share_of_flat_edges(vertices, faces, around.edge_of) < _MAX_FLAT
+    return _share_of_flat_edges(vertices, faces, edge_of) < _MAX_FLAT
 
 
 @dataclass(frozen=True)
 class Neighbours:
     """Neighbours of each vertex, with equal weights, or by inverse squared distance on surfaces of thin triangles."""
 
-    edges: Integers  # (E, 2)
-    edge_of: Integers  # (3F,) edge of every side of every face
     averaging: sparse.csr_array  # (V, V) averages over the neighbours
     length: Floats  # (V,) mean length of a vertex's edges: arithmetic, or by inverse squares as the weights are
     stretch: Floats  # (V,) arithmetic mean over mean by inverse squares of the lengths of a vertex's edges
 
     @classmethod
-    def of(cls, vertices: Floats, faces: Integers) -> Self:
+    def of(cls, vertices: Floats, edges: Integers) -> Self:
         n = len(vertices)
-        edges, edge_of = undirected_edges(faces)
-        rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
-        degree = np.maximum(np.bincount(rows, minlength=n), 1)
+        here, there = np.concatenate([edges, edges[:, ::-1]]).T
+
+        def sum_around(values: Floats) -> Floats:
+            """Return the sums (V,) of values (2E,) at the edges around each vertex."""
+            return np.asarray(np.bincount(here, values, n), dtype=np.float64)
+
         length = np.tile(edge_lengths(vertices, edges), 2)
-        weights = np.ones(len(rows))
-        mean_length = np.bincount(rows, weights=length, minlength=n) / degree
         inverse_squares = np.maximum(length, _MIN_LENGTH) ** -2.0
-        total = np.bincount(rows, weights=inverse_squares, minlength=n)
+        weights = np.ones(len(here))
+        degree = np.maximum(sum_around(weights), 1)
+        mean_length = sum_around(length) / degree
+        total = sum_around(inverse_squares)
         # Zero at a vertex without neighbours, like the arithmetic mean.
-        near_length = np.sqrt(np.divide(degree, total, out=np.zeros(n), where=total > 0))
+        squares = np.divide(degree, total, out=np.zeros(n), where=total > 0)
+        near_length = np.sqrt(squares)
         stretch = np.divide(mean_length, near_length, out=np.zeros(n), where=near_length > 0)
         if np.median(stretch) > _THIN:
             weights = inverse_squares
             mean_length = near_length
-        total = np.bincount(rows, weights=weights, minlength=n)
-        shares = weights / total[rows]
-        averaging = sparse.csr_array((shares, (rows, columns)), shape=(n, n))
-        return cls(edges, edge_of, averaging, mean_length, stretch)
-
-    @property
-    def faces_at_sides(self) -> Integers:
-        """(F, 3) number of faces that share the side from each corner to the next."""
-        n_faces = np.bincount(self.edge_of)
-        return np.asarray(n_faces[self.edge_of].reshape(-1, 3))
+        shares = weights / sum_around(weights)[here]
+        averaging = sparse.csr_array((shares, (here, there)), shape=(n, n))
+        return cls(averaging, mean_length, stretch)
 
 
 def remove_noise(vertices: Floats, faces: Integers) -> Floats:
@@ -150,18 +148,19 @@ def remove_noise(vertices: Floats, faces: Integers) -> Floats:
     """
     unit_length = _unit_of_length(vertices)
     vertices = vertices / unit_length
-    around = Neighbours.of(vertices, faces)
+    edges, edge_of = undirected_edges(faces)
+    around = Neighbours.of(vertices, edges)
+    is_boundary = np.bincount(edge_of) == 1
     free = np.ones((len(vertices), 1))
-    is_boundary = around.faces_at_sides == 1
-    free[faces[is_boundary]] = 0
-    free[np.roll(faces, -1, axis=1)[is_boundary]] = 0
+    free[edges[is_boundary]] = 0
     noise, edge = noise_and_edge(vertices, faces, around)
     smooth = vertices
     n_wanted = round(_N_PASSES * (noise / edge) ** 2)
     n_passes = min(max(n_wanted, _MIN_PASSES), _MAX_PASSES)
     for _ in range(n_passes):
         for step in (_SHRINK, _GROW):
-            smooth = smooth + step * free * (around.averaging @ smooth - smooth)
+            to_mean = around.averaging @ smooth - smooth
+            smooth = smooth + step * free * to_mean
     if np.median(around.stretch) <= _THIN:
         normals = _filter_normals(vertices, faces, smooth)
         sharp = _fit_to_normals(vertices, faces, normals, free)
@@ -175,8 +174,9 @@ def remove_noise(vertices: Floats, faces: Integers) -> Floats:
 
 def _filter_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats:
     """Return unit normals (F, 3): means over the faces that share a vertex, by area and similarity of guide normals."""
-    n_around = np.bincount(faces.ravel(), minlength=len(vertices))
-    incidence = _incidence(faces, len(vertices))[:, n_around <= _MAX_FACES_AT_VERTEX]
+    n_faces = np.bincount(faces.ravel(), minlength=len(vertices))
+    has_few = n_faces <= _MAX_FACES_AT_VERTEX
+    incidence = _incidence(faces, len(vertices))[:, has_few]
     areas = area_vectors(smooth, faces)
     normals = unit(area_vectors(vertices, faces))
     guide = unit(areas)
@@ -237,8 +237,8 @@ def noise_and_edge(vertices: Floats, faces: Integers, around: Neighbours) -> tup
     squares = (high_pass @ high_pass).power(2)
     white_noise = np.sqrt(np.asarray(squares.sum(axis=1)))
     noise = np.quantile(np.abs(residual) / white_noise, 0.25) / _QUARTILE
-    edge = np.sqrt(np.mean(around.length**2))
-    return float(noise), float(max(edge, TINY))
+    edge = math.sqrt(np.mean(around.length**2))
+    return float(noise), max(edge, TINY)
 
 
 def _unit_of_length(vertices: Floats) -> float:
@@ -252,8 +252,10 @@ def _share_of_flat_edges(vertices: Floats, faces: Integers, edge_of: Integers) -
     """Return the share of edges whose two triangles lie in one plane; `edge_of` (3F,) is the edge of each side."""
     normals = unit(area_vectors(vertices, faces))
     order = np.argsort(edge_of, kind="stable")
-    pairs = np.flatnonzero(edge_of[order[1:]] == edge_of[order[:-1]])
-    one_face = order[pairs] // 3
-    other_face = order[pairs + 1] // 3
+    side = order[:-1]
+    next_side = order[1:]
+    is_pair = edge_of[side] == edge_of[next_side]
+    one_face = side[is_pair] // 3
+    other_face = next_side[is_pair] // 3
     angles = lengths(normals[one_face] - normals[other_face])
     return float((angles < _FLAT_ANGLE).mean())

@@ -36,17 +36,23 @@ def level_surface(field: Singles, name: str) -> Surface:
         bad_edges = _non_manifold_edges(faces, len(vertices))
         if not len(bad_edges):
             return vertices.astype(np.float64), faces
-        # Fill the four or eight grid points around each vertex at which the surface meets itself.
-        last = np.array(field.shape) - 1
-        for place in vertices[np.unique(bad_edges)]:
-            low = np.maximum(np.floor(place).astype(int), 1)
-            high = np.minimum(np.ceil(place).astype(int) + 1, last)
-            box = tuple(map(slice, low, high))
-            field[box] = np.minimum(field[box], -MIN_ABS_VALUE)
+        _fill_around(field, vertices[np.unique(bad_edges)])
         field = fill_bubbles(field)
     raise MeshError(
         f"{name}: no closed surface could be extracted from the grid. Raise the resolution."
     )
+
+
+def _fill_around(field: Singles, places: Singles) -> None:
+    """Fill the four or eight grid points around each place (P, 3) at which the surface meets itself."""
+    last = np.array(field.shape) - 1
+    first_points = np.floor(places).astype(int)
+    last_points = np.ceil(places).astype(int)
+    lows = np.maximum(first_points, 1)
+    highs = np.minimum(last_points + 1, last)
+    for low, high in zip(lows, highs, strict=True):
+        box = tuple(map(slice, low, high))
+        field[box] = np.minimum(field[box], -MIN_ABS_VALUE)
 
 
 def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Surface:
@@ -96,14 +102,17 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
     for _ in range(_MAX_FLIPS):
         left, right, corners = _quadrilaterals(faces, n_vertices)
         a, b, c, d = vertices[corners]
-        gain = _angle(c, a, b) + _angle(d, b, a) - np.pi
+        angles = _angle(c, a, b) + _angle(d, b, a)
+        gain = angles - np.pi
         flips = np.flatnonzero(gain > _MIN_GAIN)
-        can_flip = _are_flat(*vertices[corners[:, flips]])
         _, _, start, end = corners[:, flips]
-        can_flip &= (start != end) & ~_are_edges(start, end, faces, n_vertices)
+        can_flip = _are_flat(*vertices[corners[:, flips]])
+        can_flip &= start != end
+        can_flip &= ~_are_edges(start, end, faces, n_vertices)
         flips = flips[can_flip]
         new_edges = edge_keys(start, end, n_vertices)[can_flip]
-        flips = flips[_independent(left[flips], right[flips], gain[flips], new_edges)]
+        chosen = _independent(left[flips], right[flips], gain[flips], new_edges)
+        flips = flips[chosen]
         if not len(flips):
             break
         a, b, c, d = corners[:, flips]
@@ -158,17 +167,17 @@ def _are_edges(a: Integers, b: Integers, faces: Integers, n_vertices: int) -> Bo
 
 def _independent(left: Integers, right: Integers, gain: Floats, new_edges: Integers) -> Integers:
     """Choose flips: each face takes part only in its best one, and no two create the same edge."""
-    last = max(left.max(initial=0), right.max(initial=0))
-    best = np.full(last + 1, -np.inf)
+    pairs = np.stack([left, right], axis=1)
+    n_faces = pairs.max(initial=-1) + 1
+    best = np.full(n_faces, -np.inf)
     np.maximum.at(best, left, gain)
     np.maximum.at(best, right, gain)
     is_best = (gain >= best[left]) & (gain >= best[right])
     chosen = np.flatnonzero(is_best)
     _, first = np.unique(new_edges[chosen], return_index=True)
     chosen = chosen[first]
-    pairs = np.stack([left[chosen], right[chosen]], axis=1)
-    n_flips = np.bincount(pairs.ravel(), minlength=last + 1)
-    is_alone = (n_flips[pairs] == 1).all(axis=1)
+    n_flips = np.bincount(pairs[chosen].ravel(), minlength=n_faces)
+    is_alone = (n_flips[pairs[chosen]] == 1).all(axis=1)
     return chosen[is_alone]
 
 

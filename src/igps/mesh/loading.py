@@ -84,7 +84,8 @@ def load_mesh(
         MeshError: the file is missing or unreadable or has no such part, or the surface is not usable.
     """
     raw = read_surface(path, options, part=part)
-    return surface_body(raw, BodyRef(Path(path), raw.part), options, least_vertices=least_vertices)
+    ref = BodyRef(Path(path), raw.part)
+    return surface_body(raw, ref, options, least_vertices=least_vertices)
 
 
 def load_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[Mesh]:
@@ -192,8 +193,8 @@ def surface_body(
     notes = (*notes, *_rounding_notes(vertices, name))
     if options.allow_open and options.mend != "always":
         try:
-            mesh = Mesh(vertices, faces, name=name, allow_open=True, notes=notes, unit=raw.unit)
-            return mesh.annotated(frame=raw.frame, given=raw.given)
+            mesh = Mesh(vertices, faces, name=name, allow_open=True)
+            return mesh.annotated(notes=notes, unit=raw.unit, frame=raw.frame, given=raw.given)
         except MeshError:
             if options.mend == "never":
                 raise
@@ -258,7 +259,8 @@ def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[Raw
     if kind in ("whole", "pieces"):
         part = None
     with faults(path, file_format):
-        bodies = list(file_format.read(path, replace(options, bodies=kind), part))
+        reading = replace(options, bodies=kind)
+        bodies = list(file_format.read(path, reading, part))
         if kind == "whole":
             return [joined(bodies)]
         if kind == "pieces" and kind not in file_format.bodies:

@@ -156,7 +156,8 @@ class _Mending:
         body = self._body(*unite_parts(*original, united), united)
         if body is not None:
             return body
-        body = watertight(self._smooth(vertices, faces, notes), faces, name=self.name)
+        smooth = self._smooth(vertices, faces, notes)
+        body = watertight(smooth, faces, name=self.name)
         notes += _open_notes(vertices, faces, body.volume)
         return body.annotated(notes=tuple(notes))
 
@@ -174,7 +175,8 @@ class _Mending:
             notes = []
         smooth = self._smooth(*surface, notes)
         last = (smooth, surface[1]) if notes else (vertices, faces)
-        return watertight(*last, name=self.name).annotated(notes=tuple(notes))
+        body = watertight(*last, name=self.name)
+        return body.annotated(notes=tuple(notes))
 
     def _body(self, vertices: Floats, faces: Integers, notes: list[str]) -> Mesh | None:
         """Return the body with this surface, smoothed if it is noisy, or None if the surface bounds no body."""

@@ -167,8 +167,8 @@ class Mesh:
 
     def numbered_by_faces(self) -> Self:
         """Return the mesh with its vertices in the order in which the faces first use them."""
-        used, first = np.unique(self.faces, return_index=True)
-        order = used[np.argsort(first)]
+        _, first = np.unique(self.faces, return_index=True)
+        order = np.argsort(first)
         rank = np.argsort(order)
         return self._changed(vertices=self.vertices[order], faces=rank[self.faces])
 
@@ -241,9 +241,10 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
             f"{name}: faces: expected integers of shape (F, 3), got {f.dtype} of shape {f.shape}."
         )
     if f.min() < 0 or f.max() >= len(v):
-        bad = int(((f < 0) | (f >= len(v))).any(axis=1).sum())
+        is_bad = ((f < 0) | (f >= len(v))).any(axis=1)
+        n_bad = int(is_bad.sum())
         raise MeshError(
-            f"{name}: {counted(bad, 'face')} with vertices out of range "
+            f"{name}: {counted(n_bad, 'face')} with vertices out of range "
             f"(0 to {len(v) - 1} exist, {f.min()} to {f.max()} are "
             "used). The file is damaged; export it again."
         )

@@ -154,9 +154,10 @@ def linked(start: Integers, end: Integers, n: int) -> tuple[int, NDArray[np.int3
 def face_parts(vertices: Floats, faces: Integers) -> tuple[Integers, Floats]:
     """Return the connected component (F,) of each face, from 0, and the areas of the components, length²."""
     _, component = components(faces, len(vertices))
-    _, part = np.unique(component[faces[:, 0]], return_inverse=True)
+    of_face = component[faces[:, 0]]
+    _, part = np.unique(of_face, return_inverse=True)
     areas = np.bincount(part, weights=face_areas(vertices, faces))
-    return part.astype(np.int64), np.asarray(areas, dtype=np.float64)
+    return part, np.asarray(areas, dtype=np.float64)
 
 
 def signed_volume(vertices: Floats, faces: Integers) -> float:

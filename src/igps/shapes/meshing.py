@@ -128,7 +128,8 @@ def _rough_area(body: Sequence[Placed]) -> float:
     volume = float(np.prod(high - low))
     spacing = (volume / _COARSE_CELLS) ** (1.0 / 3.0)
     _, grid = _sample(body, spacing)
-    n_near = float(np.count_nonzero(np.abs(grid) < spacing))
+    is_near = np.abs(grid) < spacing
+    n_near = float(np.count_nonzero(is_near))
     return n_near * spacing**2 / 2.0
 
 
@@ -136,7 +137,8 @@ def _relax(body: Sequence[Placed], vertices: Floats, faces: Integers, spacing: f
     """Slide vertices (V,3) towards their neighbours' mean along the surface, and back onto the zero level set."""
     start, end = surface.directed_edges(faces)
     n = len(vertices)
-    adjacency = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(n, n))
+    ones = np.ones(len(start))
+    adjacency = sparse.csr_array((ones, (start, end)), shape=(n, n))
     degree = np.bincount(start, minlength=n)[:, None]
     for _ in range(_RELAXATION_STEPS):
         normals = surface.vertex_normals(vertices, faces)
@@ -145,6 +147,7 @@ def _relax(body: Sequence[Placed], vertices: Floats, faces: Integers, spacing: f
         along_normal = (step * normals).sum(axis=1, keepdims=True)
         step -= normals * along_normal
         vertices = vertices + 0.7 * step
-        heights = np.clip(_distance(body, vertices), -0.5 * spacing, 0.5 * spacing)
+        heights = _distance(body, vertices)
+        heights = np.clip(heights, -0.5 * spacing, 0.5 * spacing)
         vertices -= normals * heights[:, None]
     return vertices

@@ -97,9 +97,10 @@ class Placed:
 def aim(heading: Vector, roll: float = 0.0) -> Floats:
     """Return a rotation of +z to ``heading``; before the roll, x is level, or close to x if the heading is steep."""
     z = np.array(heading) / np.linalg.norm(heading)
-    x = np.array([-z[1], z[0], 0.0])
-    if abs(z[2]) > 0.9:
-        x = np.array([1.0, 0.0, 0.0]) - z[0] * z
+    across, back, up = z
+    x = np.array([-back, across, 0.0])
+    if abs(up) > 0.9:
+        x = np.array([1.0, 0.0, 0.0]) - across * z
     x /= np.linalg.norm(x)
     y = np.cross(z, x)
     rolled = Rotation.from_euler("z", roll)
@@ -115,7 +116,9 @@ def turned(axes: str, *degrees: float) -> Floats:
 def circle(count: int, phase: float = 0.0) -> list[tuple[float, float]]:
     """Return equally spaced points (cos, sin) of the unit circle."""
     angles = phase + 2.0 * np.pi * np.arange(count) / count
-    return [(float(np.cos(angle)), float(np.sin(angle))) for angle in angles]
+    x = np.cos(angles).tolist()
+    y = np.sin(angles).tolist()
+    return list(zip(x, y, strict=True))
 
 
 def limb(
@@ -159,8 +162,9 @@ def pose(
 
     def place(part: Part, frame: Floats, origin: Floats) -> None:
         if part.group not in proportions:
-            thickness, length = np.exp(rng.uniform(-1.0, 1.0, 2) * _PROPORTIONS)
-            proportions[part.group] = (float(thickness), float(length))
+            logarithms = rng.uniform(-1.0, 1.0, 2) * _PROPORTIONS
+            thickness, length = np.exp(logarithms).tolist()
+            proportions[part.group] = (thickness, length)
         own = proportions[part.group]
         limits = flex * np.array(part.bend)
         angles = limits * rng.uniform(-1.0, 1.0, 3)

@@ -39,6 +39,10 @@ class Solid(ABC):
         return np.array([thick, thick, length])
 
 
+def _norm(x: Floats, y: Floats, z: Floats) -> Floats:
+    return np.sqrt(x**2 + y**2 + z**2)
+
+
 @dataclass(frozen=True)
 class Cone(Solid):
     """A tapered capsule: the sweep of a sphere from radius ``start`` at the origin to ``end`` at (0, 0, length)."""
@@ -84,8 +88,7 @@ class Arc(Solid):
         centre_y, centre_z = self._centre_line(turned)
         growth = (self.end - self.start) / self.angle
         tube = self.start + growth * turned
-        squared = x * x + (y - centre_y) ** 2 + (z - centre_z) ** 2
-        return np.sqrt(squared) - tube
+        return _norm(x, y - centre_y, z - centre_z) - tube
 
     def box(self) -> tuple[Floats, Floats]:
         wide = max(self.start, self.end)
@@ -119,12 +122,10 @@ class Blob(Solid):
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         a, b, c = self.radii
-        squared = (x / a) ** 2 + (y / b) ** 2 + (z / c) ** 2
-        squared_gradient = (x / a**2) ** 2 + (y / b**2) ** 2 + (z / c**2) ** 2
-        unit = np.sqrt(squared)
+        unit = _norm(x / a, y / b, z / c)
+        gradient = _norm(x / a**2, y / b**2, z / c**2)
         # Exact to first order at the surface; the bound on the gradient keeps the centre finite and inside.
-        gradient = np.maximum(np.sqrt(squared_gradient), 1e-9)
-        return unit * (unit - 1.0) / gradient - 1e-12
+        return unit * (unit - 1.0) / np.maximum(gradient, 1e-9) - 1e-12
 
     def box(self) -> tuple[Floats, Floats]:
         upper = np.array(self.radii)
@@ -143,16 +144,13 @@ class Box(Solid):
     rounding: float
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        # Distances from the sides of the box without its rounding, positive beyond them
-        squared = np.zeros(())
-        nearest = np.full((), -np.inf)
+        beyond = []  # each side of the box without its rounding
         for coordinate, size in zip((x, y, z), self.size, strict=True):
-            beyond = np.abs(coordinate) - (0.5 * size - self.rounding)
-            squared = squared + np.maximum(beyond, 0.0) ** 2
-            nearest = np.maximum(nearest, beyond)
-        outside = np.sqrt(squared)
-        inside = np.minimum(nearest, 0.0)
-        return outside + inside - self.rounding
+            beyond.append(np.abs(coordinate) - (0.5 * size - self.rounding))
+        a, b, c = beyond
+        outside = _norm(np.maximum(a, 0.0), np.maximum(b, 0.0), np.maximum(c, 0.0))
+        nearest = np.maximum(np.maximum(a, b), c)
+        return outside + np.minimum(nearest, 0.0) - self.rounding
 
     def box(self) -> tuple[Floats, Floats]:
         upper = 0.5 * np.array(self.size)

@@ -118,7 +118,7 @@ class HatSurface:
         is_near = near[:-1].any(axis=1)
         near_hats = np.where(is_near, hats, -1)
         surface = (self.faces, self.table, self.face_starts, self.incident_faces)
-        touched = Touched(np.full(n, -1), np.empty((n, 3)))
+        touched = Touched(face_at=np.full(n, -1), barycentric=np.empty((n, 3)))
         add_near_faces(x, near_hats, near, surface, row_of, last_rows, touched, pairs_for(n))
         on_surface = np.flatnonzero(touched.face_at >= 0)
         touched_faces = touched.face_at[on_surface]
@@ -129,7 +129,8 @@ class HatSurface:
 
 def _face_table(corners: Floats) -> Floats:
     """Return `HatSurface.table`, from the corners (F, 3, 3)."""
-    sides = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
+    following = np.roll(corners, -1, axis=1)
+    sides = np.roll(corners, -2, axis=1) - following
     normals = np.cross(sides[:, 0], sides[:, 1])
     double_areas = lengths(normals)[:, None]
     normals /= double_areas
@@ -171,9 +172,11 @@ def _hats(vertices: Floats, incidence: sparse.csr_matrix, corners: Floats, table
     centres = (vertices + total) / 4
     to_vertex = vertices - centres
     mixed = _outer(vertices, total)
-    own = 2 * _outer(vertices, vertices)
-    hat_moments = (own + mixed + mixed.transpose(0, 2, 1) + moments) / 20
-    covariance = hat_moments - _outer(centres, centres)
+    hat_moments = 2 * _outer(vertices, vertices)
+    hat_moments += mixed
+    hat_moments += mixed.transpose(0, 2, 1)
+    hat_moments += moments
+    covariance = hat_moments / 20 - _outer(centres, centres)
     shifts = vertices / 4 - centres
     normal_moments = normal_moments + _outer(flux, shifts)
     trace = np.trace(covariance, axis1=1, axis2=2)[:, None]
@@ -264,7 +267,7 @@ class HatClusters:
 
     def far_clusters(self, x: Floats, ratio: float) -> tuple[Integers, Integers]:
         """Return the clusters that are `ratio` or more radii from the box of points x (3, n), and the other hats."""
-        box = x.min(axis=1), x.max(axis=1)
+        box = (x.min(axis=1), x.max(axis=1))
         balls = self.centres, self.radii, self.level_starts
         stack = np.empty((len(self.radii), 2), np.int64)
         clusters = np.empty(len(self.radii), np.int64)

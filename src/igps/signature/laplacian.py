@@ -43,8 +43,9 @@ def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_ma
         raise ImportError(f'backend="robust" needs robust-laplacian: {remedy}.') from error
     # Scale the mesh to unit size, because robust-laplacian mollifies by an absolute length.
     scale = longest_side(mesh.vertices)
-    centred = (mesh.vertices - mesh.vertices.mean(axis=0)) / scale
-    stiffness, mass = robust_laplacian.mesh_laplacian(centred, np.asarray(mesh.faces))
+    centred = mesh.vertices - mesh.vertices.mean(axis=0)
+    faces = np.asarray(mesh.faces)
+    stiffness, mass = robust_laplacian.mesh_laplacian(centred / scale, faces)
     return stiffness.tocsr(), mass.diagonal() * scale**2
 
 

@@ -106,7 +106,8 @@ class Extension:
         type_name = np.dtype(dtype).name
         if type_name not in ("float32", "float64"):
             raise ValueError(f"dtype: expected float32 or float64, got {type_name}")
-        scaled, scaled_faces, _ = _scaled(vertices, faces, np.zeros((0, 3)))
+        no_points = np.zeros((0, 3))
+        scaled, scaled_faces, _ = _scaled(vertices, faces, no_points)
         values = np.asarray(functions)
         if values.ndim != 2 or len(values) != len(scaled):
             raise ValueError(
@@ -250,7 +251,8 @@ class Extension:
         # To first order, a distance d changes by error · (checked − others) / d.
         errors = checked - exact
         along_checked = (errors * checked).sum(axis=1, keepdims=True)
-        changes = along_checked - errors @ others.T
+        along_others = errors @ others.T
+        changes = along_checked - along_others
         squared = cdist(checked, others, "sqeuclidean")
         is_apart = squared > 0
         if not is_apart.any():
@@ -263,7 +265,8 @@ def _far_ratios(accuracy: float | None) -> tuple[float, float]:
     """Return the smallest distances, in radii, of far hats and far clusters; a far cluster contains no near hat."""
     if accuracy is None:
         return math.inf, math.inf
-    hats = max(_MIN_FAR_RATIO, (_HAT_ERROR / accuracy) ** (1 / 3))
+    hats = (_HAT_ERROR / accuracy) ** (1 / 3)
+    hats = max(hats, _MIN_FAR_RATIO)
     clusters = 1 + (_CLUSTER_ERROR / accuracy) ** (1 / 3)
     return hats, max(hats, clusters)
 

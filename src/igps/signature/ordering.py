@@ -45,8 +45,10 @@ def ordering_keys(
     samples: around the axis of a vase the surface is the same everywhere, but the grid and the triangles are not.
     """
     scaled = eigenvalues * area
-    weights = np.sqrt(area / scaled) * np.exp(-scaled / _CUTOFF)
-    n_used = int((weights > _MIN_WEIGHT * weights[0]).sum())  # weights decrease
+    weights = np.sqrt(area / scaled)
+    weights *= np.exp(-scaled / _CUTOFF)
+    is_used = weights > _MIN_WEIGHT * weights[0]  # up to some index, as weights decrease
+    n_used = int(is_used.sum())
     embedding = eigenfunctions[:, :n_used] * weights[:n_used]
     return _keys(embedding, tie_breakers)
 
@@ -93,7 +95,8 @@ def nearest_spacing(points: Floats) -> Floats:
     """Return each point's (P, 3) mean distance from its neighbours, over the mean of all: tie-breakers (P,)."""
     n_neighbours = min(_N_NEIGHBOURS + 1, len(points))
     distances, _ = cKDTree(points).query(points, n_neighbours)
-    spacing = distances.reshape(len(points), n_neighbours).mean(axis=1)
+    distances = distances.reshape(len(points), n_neighbours)
+    spacing = distances.mean(axis=1)
     return spacing / max(spacing.mean(), TINY)
 
 
@@ -112,7 +115,8 @@ def systematic_sample(sizes: Floats, n: int, generator: np.random.Generator) -> 
     """
     ends = np.cumsum(sizes)
     part = ends[-1] / n
-    positions = (np.arange(n) + generator.random(n)) * part
+    in_part = generator.random(n)
+    positions = (np.arange(n) + in_part) * part
     drawn = np.searchsorted(ends, positions, side="right")
     last = np.flatnonzero(sizes)[-1]
     return np.minimum(drawn, last)
@@ -130,11 +134,13 @@ def spatial_order(points: Floats, size: int) -> Integers:
     order = np.minimum(np.arange(size << n_cuts), n_points)
     # Index n_points is padding: the mean point for bounding boxes, behind all others for cuts.
     padding = points.mean(axis=0)
-    padded = np.ascontiguousarray(np.vstack([points, padding]).T)
+    padded = np.vstack([points, padding])
+    padded = np.ascontiguousarray(padded.T)
     for cut in range(n_cuts):
         n_boxes = 1 << cut
         boxes = padded.take(order, axis=1).reshape(3, n_boxes, -1)
-        longest = np.ptp(boxes, axis=2).argmax(axis=0)
+        sides = np.ptp(boxes, axis=2)
+        longest = sides.argmax(axis=0)
         along = boxes[longest, np.arange(n_boxes)]
         order = order.reshape(along.shape)
         along[order == n_points] = np.inf

@@ -40,15 +40,17 @@ def surface_points(
     generator = np.random.default_rng(seed)
     areas = face_areas(mesh.vertices, mesh.faces)
     if keys is None:
-        face = generator.choice(len(areas), size=n_points, p=areas / areas.sum())
+        shares = areas / areas.sum()
+        face = generator.choice(len(areas), size=n_points, p=shares)
         return SurfacePoints(mesh, face, _in_triangles(n_points, generator))
     corner_keys = keys[mesh.faces]
     order = np.argsort(corner_keys.sum(axis=1), kind="stable")
     drawn = systematic_sample(areas[order], n_points, generator)
     face = order[drawn]
     corner_order = np.argsort(corner_keys, axis=1)[face]
+    in_triangles = _in_triangles(n_points, generator)
     weights = np.empty((n_points, 3))
-    np.put_along_axis(weights, corner_order, _in_triangles(n_points, generator), axis=1)
+    np.put_along_axis(weights, corner_order, in_triangles, axis=1)
     return SurfacePoints(mesh, face, weights)
 
 

@@ -70,7 +70,8 @@ def lanczos(
     max_size = math.ceil(MAX_BASIS_FACTOR * BASIS_PER_EIGENPAIR * n_eigenpairs) + MAX_BASIS_EXTRA
     max_size = min(max_size, len(zero_mode) - 2 * block_size)
     generator = np.random.default_rng(seed)
-    with Team(None if n_eigenpairs * len(zero_mode) >= MIN_TEAM_RESULT else 1) as team:
+    max_threads = None if n_eigenpairs * len(zero_mode) >= MIN_TEAM_RESULT else 1
+    with Team(max_threads) as team:
         shift, factors = _factorize_inside(tree, matrix, zero_mode, n_eigenpairs, tolerance, team)
         n_below = factors.n_negative - 1  # without the zero mode
         capacity = first_size + 3 * block_size
@@ -141,7 +142,8 @@ def _factorize_inside(
         if best is None or (off_target, defect) < best[:2]:
             best = off_target, defect, shift, factors
         if off_target > 0:
-            shift *= min(4.0, max(0.25, target / max(rank, 1)))
+            growth = target / max(rank, 1)
+            shift *= min(4.0, max(0.25, growth))
         elif defect > MAX_DEFECT * tolerance:
             shift *= 0.97
         else:

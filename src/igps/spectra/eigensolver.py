@@ -126,13 +126,15 @@ def eigenpairs(
     area = mass.sum()
     scale = np.sqrt(area / mass)
     matrix = stiffness.copy()
-    matrix.data *= scale.repeat(np.diff(matrix.indptr)) * scale[matrix.indices]
+    of_rows = scale.repeat(np.diff(matrix.indptr))
+    matrix.data *= of_rows * scale[matrix.indices]
 
     def dense() -> tuple[np.ndarray, np.ndarray]:
         return eigh(matrix.toarray(), subset_by_index=(1, n_eigenpairs), overwrite_a=True)
 
     def krylov() -> tuple[np.ndarray, np.ndarray]:
-        return lanczos(matrix, np.sqrt(mass / area), n_eigenpairs, positions, tolerance, seed)
+        zero_mode = np.sqrt(mass / area)
+        return lanczos(matrix, zero_mode, n_eigenpairs, positions, tolerance, seed)
 
     def arpack() -> tuple[np.ndarray, np.ndarray]:
         n_computed = min(n_eigenpairs + N_GUARDS, len(mass) - 2)
@@ -142,9 +144,10 @@ def eigenpairs(
         vectors = eigenfunctions[:, :n_eigenpairs] * np.sqrt(mass)[:, None]
         return eigenvalues[:n_eigenpairs], vectors
 
-    is_small = len(mass) <= max(MAX_DENSE_VERTICES, MAX_DENSE_VERTICES_PER_EIGENPAIR * n_eigenpairs)
+    max_dense = max(MAX_DENSE_VERTICES, MAX_DENSE_VERTICES_PER_EIGENPAIR * n_eigenpairs)
+    solver = dense if len(mass) <= max_dense else krylov
     try:
-        eigenvalues, vectors, residual = _refined(dense if is_small else krylov, matrix, tolerance)
+        eigenvalues, vectors, residual = _refined(solver, matrix, tolerance)
     except _FAILURES as error:
         logger.warning("falling back to ARPACK: %s", error)
         try:
@@ -178,7 +181,8 @@ def _refined(
 def _arpack(
     stiffness: sparse.csr_array, mass: np.ndarray, n_eigenpairs: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    start = np.random.default_rng(seed).standard_normal(len(mass))
+    generator = np.random.default_rng(seed)
+    start = generator.standard_normal(len(mass))
     shift = -0.01 / mass.sum()
     try:
         eigenvalues, eigenfunctions = eigsh(
@@ -235,7 +239,8 @@ def _residual(
         if not (residuals <= tolerance).all():
             magnitudes = abs(matrix) @ np.abs(y)
             rounding = np.linalg.norm(magnitudes, axis=0) * ROUNDING / np.abs(values)
-            allowed = np.maximum(tolerance, np.minimum(tolerance + rounding, RESIDUAL_LIMIT))
+            allowed = np.minimum(tolerance + rounding, RESIDUAL_LIMIT)
+            allowed = np.maximum(allowed, tolerance)
             failed = ~(residuals <= allowed)
             if failed.any():
                 raise ConvergenceError(

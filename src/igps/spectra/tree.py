@@ -65,7 +65,8 @@ def tree_structure(
         has_child = side >= 0
         parent[side[has_child]] = np.flatnonzero(has_child)
     depth = np.empty(n_nodes, np.int64)
-    depth[node_at] = np.log2(np.arange(1, n_nodes + 1))
+    places = np.arange(n_nodes)
+    depth[node_at] = np.log2(places + 1)
     own_start = _starts(node_of, n_nodes)
     pairs = _boundaries(own_start, parent, depth, position, indptr, indices)
     owner, boundary = np.divmod(pairs, len(node))
@@ -84,7 +85,8 @@ def tree_structure(
     is_above = np.ones(n_nodes, dtype=bool)
     for begin, end in subtrees:
         is_above[begin:end] = False
-    above = [(n, n + 1) for n in np.flatnonzero(is_above).tolist()]
+    others = np.flatnonzero(is_above).tolist()
+    above = [(n, n + 1) for n in others]
     nodes = np.zeros((7, n_nodes + 1), np.int64)
     nodes[OWN] = own_start
     nodes[BOUNDARY] = boundary_start
@@ -140,8 +142,10 @@ def _boundaries(
         is_after = reached >= own_start[node + 1]
         return node[is_after] * n_vertices + reached[is_after]
 
-    owner = np.repeat(np.arange(len(parent)), np.diff(own_start))
-    node_of_edge = np.repeat(owner[position], np.diff(indptr))
+    n_own = np.diff(own_start)
+    n_edges = np.diff(indptr)
+    owner = np.repeat(np.arange(len(n_own)), n_own)
+    node_of_edge = np.repeat(owner[position], n_edges)
     from_edges = after(node_of_edge, position[indices])
     depth_of_edge = depth[from_edges // n_vertices]
     inherited = from_edges[:0]
