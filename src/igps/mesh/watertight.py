@@ -11,6 +11,7 @@ with joined pieces is nearly as good as with the whole body. With the spectra of
 largest piece alone, it is far worse.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -92,7 +93,9 @@ def watertight(
     grid = Grid.around(vertices, faces, min_size)
     vertices = grid.to_cells(vertices)
     surface = OrientedSurface.of(vertices, faces)
-    thickness = surface.thickness * min_size if surface.is_nearly_closed else np.inf
+    thickness = math.inf
+    if surface.is_nearly_closed:
+        thickness = surface.thickness * min_size
     cell = float(np.clip(thickness / _FINE, min_size, default_size))
     if thickness < _COARSE * cell:
         notes.append(f"coarse: about {4 * thickness / cell:.1f} cells thick")
@@ -113,7 +116,8 @@ def watertight(
     notes.append(f"made watertight on a grid of {sides} cells")
     if max_vertices is not None:
         vertices, faces = simplify_surface(vertices, faces, max_vertices)
-    return Mesh(grid.from_cells(vertices), faces, name=name, notes=tuple(notes))
+    vertices = grid.from_cells(vertices)
+    return Mesh(vertices, faces, name=name, notes=tuple(notes))
 
 
 def crosses_itself(vertices: Floats, faces: Integers) -> bool:
@@ -150,7 +154,8 @@ def splats(
         _, first = np.unique(lattice, axis=0, return_index=True)
         points = points[first]
         normals = None if normals is None else normals[first]
-    distance, neighbours = cKDTree(points).query(points, k=min(13, len(points)))
+    n_neighbours = min(13, len(points))
+    distance, neighbours = cKDTree(points).query(points, k=n_neighbours)
     # In an even cloud, a disc reaches about the third ring of neighbours; its radius is bounded where points are rare.
     reach = distance[:, min(6, distance.shape[1] - 1)]
     spacing = float(np.median(reach))

@@ -115,17 +115,18 @@ class ArticulatedShapes:
         skeleton = self.templates[label]()
         name = f"{label}/{number:02d}"
         motion = np.random.default_rng([self.seed, _MOTION, class_index, number])
-        rotation = np.asarray(Rotation.from_quat(motion.normal(size=4)).as_matrix())
+        quaternion = motion.normal(size=4)
+        rotation = np.asarray(Rotation.from_quat(quaternion).as_matrix())
         fault: str | None = None
         for attempt in range(_MAX_ATTEMPTS):
             rng = np.random.default_rng([self.seed, _POSE, class_index, number, attempt])
             target = int(self.n_vertices * rng.uniform(0.8, 1.25))
             # Later attempts bend less: most failures are limbs that touch.
-            body = pose(skeleton, rng, 1.0 - 0.8 * attempt / _MAX_ATTEMPTS, rotation)
+            flex = 1.0 - 0.8 * attempt / _MAX_ATTEMPTS
+            body = pose(skeleton, rng, flex, rotation)
             vertices, faces, spacing = mesh(body, target)
-            vertices = roughen(
-                vertices, faces, spacing * rng.uniform(0.0, 0.12), 10.0 * spacing, rng
-            )
+            amplitude = spacing * rng.uniform(0.0, 0.12)
+            vertices = roughen(vertices, faces, amplitude, 10.0 * spacing, rng)
             fault = defect(vertices, faces, skeleton.genus, self.n_vertices)
             if fault is None:
                 vertices += rng.uniform(-1.0, 1.0, 3)
@@ -152,9 +153,8 @@ class ArticulatedShapes:
             seed=self.seed,
             n_vertices=self.n_vertices,
         )
-        for index, name in enumerate(
-            Progress(self.names, desc="shapes", unit="shape", disable=not progress)
-        ):
+        names = Progress(self.names, desc="shapes", unit="shape", disable=not progress)
+        for index, name in enumerate(names):
             path = folder / f"{name}.off"
             if not path.exists():
                 shape = self[index]

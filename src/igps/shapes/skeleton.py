@@ -41,6 +41,13 @@ class Part:
         """Return a copy at another place, with +z along ``heading``, rotated around it by ``roll`` radians."""
         return replace(self, at=at, turn=aim(heading, roll))
 
+    def on_both_sides(self, at: Vector, heading: Vector) -> tuple[Part, Part]:
+        """Return a copy at another place, see `joined`, and before it one at the mirror image of that place in x."""
+        x, y, z = at
+        across, back, up = heading
+        mirrored = self.joined((-x, y, z), (-across, back, up))
+        return mirrored, self.joined(at, heading)
+
     def walk(self) -> Iterator[Part]:
         """Iterate over this part and its descendants."""
         yield self

@@ -51,8 +51,8 @@ def biped() -> Skeleton:
         at=(0, 0, 0.85),
         lift=0.3,
     )
-    arms = [arm.joined((0.3 * s, 0, 0.72), heading=(s, -0.15, -0.35)) for s in (-1, 1)]
-    legs = [leg.joined((0.17 * s, 0, -0.02), heading=(0.2 * s, 0, -1)) for s in (-1, 1)]
+    arms = arm.on_both_sides((0.3, 0, 0.72), heading=(1, -0.15, -0.35))
+    legs = leg.on_both_sides((0.17, 0, -0.02), heading=(0.2, 0, -1))
     return Skeleton(
         Part(
             Cone(0.75, 0.25, 0.29),
@@ -74,7 +74,7 @@ def quadruped() -> Skeleton:
         radii=[0.09, 0.08],
         bends=[(10, 10)],
     )
-    ears = [ear.joined((0.1 * s, 0, 0.5), heading=(0.5 * s, 0.2, 1)) for s in (-1, 1)]
+    ears = ear.on_both_sides((0.1, 0, 0.5), heading=(0.5, 0.2, 1))
     neck = limb(
         "neck",
         lengths=[0.42],
@@ -91,24 +91,17 @@ def quadruped() -> Skeleton:
     bones = [0.42, 0.42]
     radii = [0.15, 0.11, 0.1]
     bends = [(22, 6), (22, 0)]
-    pairs = [
-        (
-            limb(
+    legs = []
+    for s in (-1, 1):
+        for group, y in (("fore", -0.48), ("hind", 0.48)):
+            leg = limb(
                 group,
                 lengths=bones,
                 radii=radii,
                 bends=bends,
                 knee=(0, 0.15, 1),
-            ),
-            y,
-        )
-        for group, y in (("fore", -0.48), ("hind", 0.48))
-    ]
-    legs = [
-        leg.joined((0.18 * s, y, -0.12), heading=(0.12 * s, 0, -1))
-        for s in (-1, 1)
-        for leg, y in pairs
-    ]
+            )
+            legs.append(leg.joined((0.18 * s, y, -0.12), heading=(0.12 * s, 0, -1)))
     return Skeleton(
         Part(
             Blob((0.29, 0.75, 0.31)),
@@ -126,15 +119,15 @@ def octopus() -> Skeleton:
         bends=bends,
         knee=(0, 0.12, 1),
     )
-    arms = tuple(
-        (arm.joined((0.24 * c, 0.24 * s, 0.0), heading=(c, s, -0.35)) for c, s in circle(8))
-    )
+    arms = []
+    for c, s in circle(8):
+        arms.append(arm.joined((0.24 * c, 0.24 * s, 0.0), heading=(c, s, -0.35)))
     return Skeleton(
         Part(
             Blob((0.4, 0.4, 0.52)),
             lift=0.25,
             blend=0.1,
-            children=arms,
+            children=tuple(arms),
         )
     )
 
@@ -164,7 +157,7 @@ def spider() -> Skeleton:
         for s in (-1, 1)
         for y in (-0.27, -0.09, 0.09, 0.27)
     ]
-    fangs = [fang.joined((0.1 * s, -0.25, 0), heading=(0.3 * s, -1, -0.4)) for s in (-1, 1)]
+    fangs = fang.on_both_sides((0.1, -0.25, 0), heading=(0.3, -1, -0.4))
     return Skeleton(
         Part(
             Blob((0.27, 0.36, 0.22)),

@@ -49,8 +49,8 @@ def ordering_keys(
     weights *= np.exp(-scaled / _CUTOFF)
     is_used = weights > _MIN_WEIGHT * weights[0]  # up to some index, as weights decrease
     n_used = int(is_used.sum())
-    embedding = eigenfunctions[:, :n_used] * weights[:n_used]
-    return _keys(embedding, tie_breakers)
+    functions = eigenfunctions[:, :n_used]
+    return _keys(functions * weights[:n_used], tie_breakers)
 
 
 def spatial_ordering_keys(mesh: Mesh) -> Floats:

@@ -107,7 +107,8 @@ class Krylov(Basis):
         quick = self._factor_quickly(product, remainder, scale)
         if quick is None:
             self._reorthogonalise()
-        block, coupling = quick or self._orthonormal(product, near=self._previous, scale=scale)
+        orthonormal = quick or self._orthonormal(product, near=self._previous, scale=scale)
+        block, coupling = orthonormal
         self._projected[last, last] = (diagonal + diagonal.T) / 2
         self._previous = self._current
         self._current = self._stop
@@ -223,7 +224,8 @@ class Krylov(Basis):
         squares = self._sum_pieces(remove)
         error = (squares - identity(len(new))).abs().max()
         if error > ROUNDING:
-            self._multiply(_inverse(torch.linalg.cholesky(squares)), new, new)
+            factor = torch.linalg.cholesky(squares)
+            self._multiply(_inverse(factor), new, new)
         self._mark_orthogonal()
         return loss
 
@@ -250,7 +252,8 @@ class Krylov(Basis):
     def _factor_rows(self, block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Return orthonormal rows Q and R with blockᵀ = Qᵀ R; directions lost in rounding get random rows and no R."""
         factor, failed = torch.linalg.cholesky_ex(block @ block.T)
-        if not failed and torch.diagonal(factor).min() > MIN_CHOLESKY_PIVOT * scale:
+        smallest = torch.diagonal(factor).min()
+        if not failed and smallest > MIN_CHOLESKY_PIVOT * scale:
             return _inverse(factor) @ block, factor.T
         q, r, order = qr(block.T.numpy(), mode="economic", pivoting=True)
         is_lost = np.abs(np.diag(r)) <= ROUNDING * scale
@@ -258,7 +261,8 @@ class Krylov(Basis):
         rows = torch.from_numpy(np.ascontiguousarray(q.T))
         if is_lost.any():
             substitutes = self._random(int(is_lost.sum()))
-            rows[torch.from_numpy(is_lost)] = substitutes / math.sqrt(block.shape[1])
+            substitutes /= math.sqrt(block.shape[1])
+            rows[torch.from_numpy(is_lost)] = substitutes
         unsorted = r[:, np.argsort(order)]
         return rows, torch.from_numpy(unsorted)
 

@@ -58,19 +58,14 @@ def lanczos(
     # Solves are faster if vectors are stored in elimination order.
     tree, matrix, order = analyse(matrix, positions).arranged(matrix)
     zero_mode = zero_mode[order]
-    is_small = (
-        n_eigenpairs <= MAX_SMALL_BLOCK_PAIRS
-        or n_eigenpairs * len(zero_mode) > MAX_LARGE_BLOCK_RESULT
-    )
-    block_size = SMALL_BLOCK if is_small else LARGE_BLOCK
-    digits = -math.log10(max(tolerance, ROUNDING)) - 7
-    n_blocks = BASIS_BLOCKS + BASIS_BLOCKS_PER_DECADE * math.log10(n_eigenpairs)
-    n_blocks = max(1, n_blocks + BASIS_BLOCKS_PER_DIGIT * digits)
-    first_size = math.ceil(BASIS_PER_EIGENPAIR * n_eigenpairs + n_blocks * block_size)
-    max_size = math.ceil(MAX_BASIS_FACTOR * BASIS_PER_EIGENPAIR * n_eigenpairs) + MAX_BASIS_EXTRA
+    result_size = n_eigenpairs * len(zero_mode)
+    block_size = LARGE_BLOCK
+    if n_eigenpairs <= MAX_SMALL_BLOCK_PAIRS or result_size > MAX_LARGE_BLOCK_RESULT:
+        block_size = SMALL_BLOCK
+    first_size, max_size = _basis_sizes(n_eigenpairs, block_size, tolerance)
     max_size = min(max_size, len(zero_mode) - 2 * block_size)
     generator = np.random.default_rng(seed)
-    max_threads = None if n_eigenpairs * len(zero_mode) >= MIN_TEAM_RESULT else 1
+    max_threads = None if result_size >= MIN_TEAM_RESULT else 1
     with Team(max_threads) as team:
         shift, factors = _factorize_inside(tree, matrix, zero_mode, n_eigenpairs, tolerance, team)
         n_below = factors.n_negative - 1  # without the zero mode
@@ -114,6 +109,17 @@ def lanczos(
                 krylov.widen()
             for _ in range(2):
                 krylov.expand()
+
+
+def _basis_sizes(n_eigenpairs: int, block_size: int, tolerance: float) -> tuple[int, int]:
+    """Return the size of the basis at which usually all pairs have converged, and that at which the iteration stops."""
+    n_vectors = BASIS_PER_EIGENPAIR * n_eigenpairs
+    digits = -math.log10(max(tolerance, ROUNDING)) - 7
+    n_blocks = BASIS_BLOCKS + BASIS_BLOCKS_PER_DECADE * math.log10(n_eigenpairs)
+    n_blocks = max(1, n_blocks + BASIS_BLOCKS_PER_DIGIT * digits)
+    first_size = math.ceil(n_vectors + n_blocks * block_size)
+    max_size = math.ceil(MAX_BASIS_FACTOR * n_vectors) + MAX_BASIS_EXTRA
+    return first_size, max_size
 
 
 def _factorize_inside(
