@@ -1,7 +1,7 @@
 """Compute the signed distances of grid points to the surface of one body, negative inside. Lengths are in cells."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -11,7 +11,7 @@ from scipy import ndimage, sparse
 
 from igps._arrays import Booleans, Floats, Integers, Singles
 from igps.mesh._outside import MARGIN, WALL, OrientedSurface
-from igps.mesh.surface import box_sides, face_areas
+from igps.mesh.surface import box_sides, edge_keys, face_areas
 
 # Maximal exact distance: marching cubes need distances at both ends of the grid edges that cross the surface.
 _BAND = 1.1
@@ -34,9 +34,10 @@ class Grid:
     def around(cls, vertices: Floats, faces: Integers, cell: float) -> Self:
         low = vertices[faces].min(axis=(0, 1))
         high = vertices[faces].max(axis=(0, 1))
-        shape = np.ceil((high - low) / cell).astype(int) + 1 + 2 * MARGIN
+        n_cells = np.ceil((high - low) / cell).astype(int) + 2 * MARGIN
+        shape = n_cells + 1
         # The grid is centred on the body, so that it moves with the body.
-        origin = (low + high) / 2 - (shape - 1) / 2 * cell
+        origin = (low + high) / 2 - n_cells / 2 * cell
         n_x, n_y, n_z = shape.tolist()
         return cls(origin, cell, (n_x, n_y, n_z))
 
@@ -152,9 +153,10 @@ def _inside(
     """
     from skimage.segmentation import watershed
 
+    is_wall = distance <= WALL
     sides = np.where(outside, 1, 2)
-    sides = np.where(distance <= WALL, 0, sides).astype(np.int32)
-    undecided = np.flatnonzero(np.take(distance, band) <= WALL)
+    sides = np.where(is_wall, 0, sides).astype(np.int32)
+    undecided = np.flatnonzero(np.take(is_wall, band))
     for step in (0.75, 1.0, 1.25):
         beyond = _nearest_values(sides, feet[undecided] + step * normals[undecided])
         is_decided = beyond > 0
@@ -212,40 +214,47 @@ def join_pieces(field: Singles, notes: list[str], radius: float = 0.0) -> Single
     if n_pieces < 2:
         return field
     bar_radius = max(radius, _MIN_BAR_RADIUS)
-    for a, b in _narrowest_gaps(label):
+    starts, ends = _narrowest_gaps(label)
+    for a, b in zip(starts, ends, strict=True):
         _add_bar(field, a, b, bar_radius)
     notes.append(f"joined {n_pieces} pieces by bars")
     return fill_bubbles(field)
 
 
-def _narrowest_gaps(label: NDArray[np.int32]) -> Iterator[tuple[Floats, Floats]]:
-    """Yield the two ends (3,) of gaps between pieces, by their labels, that join them with the least total length."""
+def _narrowest_gaps(label: NDArray[np.int32]) -> tuple[Floats, Floats]:
+    """Return both ends (L, 3) of gaps between pieces, given by labels, that join all with the least total length."""
     # The width of a gap is measured where the regions touch that are nearest to either piece.
     distance, index = ndimage.distance_transform_edt(label == 0, return_indices=True)
     owner = label[tuple(index)]
-    contacts = []
-    _, n_y, n_z = label.shape
-    for axis, step in enumerate((n_y * n_z, n_z, 1)):
-        borders = np.nonzero(np.diff(owner, axis=axis))
-        here = np.ravel_multi_index(borders, label.shape)
-        contacts.append((here, here + step))
-    start, end = np.concatenate(contacts, axis=1)
+    start, end = _borders(owner)
     width = np.take(distance, start) + np.take(distance, end) + 1
     n_labels = int(label.max()) + 1
     first = np.take(owner, start).astype(np.int64)
     second = np.take(owner, end).astype(np.int64)
-    pair = np.minimum(first, second) * n_labels + np.maximum(first, second)
+    pair_of = edge_keys(first, second, n_labels)
     order = np.argsort(width, kind="stable")
-    _, narrowest = np.unique(pair[order], return_index=True)
+    pairs, narrowest = np.unique(pair_of[order], return_index=True)
     chosen = order[narrowest]
     ends = (first[chosen], second[chosen])
     graph = sparse.csr_array((width[chosen], ends), shape=(n_labels, n_labels))
     tree = sparse.csgraph.minimum_spanning_tree(graph).tocoo()
-    contact_of = {(int(first[k]), int(second[k])): k for k in chosen}
+    links = edge_keys(tree.row.astype(np.int64), tree.col.astype(np.int64), n_labels)
+    contacts = chosen[np.searchsorted(pairs, links)]
     nearest = index.reshape(3, -1).astype(np.float64)
-    for link in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
-        contact = contact_of[link]
-        yield nearest[:, start[contact]], nearest[:, end[contact]]
+    return nearest[:, start[contacts]].T, nearest[:, end[contacts]].T
+
+
+def _borders(owner: NDArray[np.int32]) -> tuple[Integers, Integers]:
+    """Return the numbers (C,), in the flattened grid, of neighbouring points that have different owners."""
+    _, n_y, n_z = owner.shape
+    starts = []
+    ends = []
+    for axis, step in enumerate((n_y * n_z, n_z, 1)):
+        borders = np.nonzero(np.diff(owner, axis=axis))
+        here = np.ravel_multi_index(borders, owner.shape)
+        starts.append(here)
+        ends.append(here + step)
+    return np.concatenate(starts), np.concatenate(ends)
 
 
 def _add_bar(field: Singles, a: Floats, b: Floats, radius: float) -> None:

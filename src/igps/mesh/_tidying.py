@@ -303,8 +303,8 @@ def _span(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
     if n == 3:
         return vertices, np.vstack([faces, loop[None]])
     rim = vertices[loop]
-    sides = lengths(rim - np.roll(rim, 1, axis=0))
-    along = np.cumsum(sides)
+    before = np.roll(rim, 1, axis=0)
+    along = np.cumsum(lengths(rim - before))
     n_rings = max(round(n / (2 * np.pi)), 1)
     disc = [_circle(along / along[-1], 1.0)]
     for ring in range(1, n_rings):
@@ -316,9 +316,10 @@ def _span(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
     plane = np.concatenate(disc)
     patch = Delaunay(plane).simplices.astype(np.int64)  # counter-clockwise, like the loop
     film = _solve_umbrella(rim, patch, len(plane), order=1)
-    new = len(vertices) + np.arange(len(film))
-    index = np.append(loop, new)
-    return np.vstack([vertices, film]), np.vstack([faces, index[patch]])
+    index = np.append(loop, len(vertices) + np.arange(len(film)))
+    vertices = np.vstack([vertices, film])
+    faces = np.vstack([faces, index[patch]])
+    return vertices, faces
 
 
 def _circle(turns: Floats, radius: float) -> Floats:

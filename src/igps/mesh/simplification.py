@@ -81,28 +81,28 @@ def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
 def _cut(vertices: Floats, faces: Integers, middle: Integers) -> Integers:
     """Divide faces at the vertices in the middle of their sides (F, 3), each from a corner to the next; -1 for none."""
     n_cut = (middle >= 0).sum(axis=1)
-    pieces = [faces[n_cut == 0]]
-    for n in (1, 2, 3):
+
+    def rotated(n: int) -> tuple[Integers, ...]:
+        """Return corners a, b, c and middles of ab, bc, ca of the faces with n cut sides, which come first."""
         chosen = n_cut == n
-        middles = middle[chosen]
-        # The corners are rotated so that the cut sides come first.
-        turn = np.argmax(middles >= 0, axis=1)
-        if n == 2:
-            turn = np.argmin(middles >= 0, axis=1) + 1
-        order = (np.arange(3) + turn[:, None]) % 3
-        a, b, c = np.take_along_axis(faces[chosen], order, axis=1).T
-        p, q, r = np.take_along_axis(middles, order, axis=1).T
-        if n == 1:
-            corners = [(a, p, c), (p, b, c)]
-        elif n == 2:
-            # The quadrilateral a p q c is divided along its shorter diagonal.
-            from_a = lengths(vertices[a] - vertices[q])
-            from_p = lengths(vertices[p] - vertices[c])
-            by_a = from_a < from_p
-            second = (a, np.where(by_a, q, p), c)
-            third = (np.where(by_a, a, p), np.where(by_a, p, q), np.where(by_a, q, c))
-            corners = [(p, b, q), second, third]
-        else:
-            corners = [(a, p, r), (p, b, q), (r, q, c), (p, q, r)]
-        pieces.extend(np.stack(corner, axis=1) for corner in corners)
-    return np.vstack(pieces)
+        is_cut = middle[chosen] >= 0
+        first = np.argmin(is_cut, axis=1) + 1 if n == 2 else np.argmax(is_cut, axis=1)
+        order = (np.arange(3) + first[:, None]) % 3
+        corners = np.take_along_axis(faces[chosen], order, axis=1)
+        middles = np.take_along_axis(middle[chosen], order, axis=1)
+        return *corners.T, *middles.T
+
+    a, b, c, p, _, _ = rotated(1)
+    pieces = [(a, p, c), (p, b, c)]
+    a, b, c, p, q, _ = rotated(2)
+    # The quadrilateral a p q c is divided along its shorter diagonal.
+    from_a = lengths(vertices[a] - vertices[q])
+    from_p = lengths(vertices[p] - vertices[c])
+    by_a = from_a < from_p
+    second = (a, np.where(by_a, q, p), c)
+    third = (np.where(by_a, a, p), np.where(by_a, p, q), np.where(by_a, q, c))
+    pieces += [(p, b, q), second, third]
+    a, b, c, p, q, r = rotated(3)
+    pieces += [(a, p, r), (p, b, q), (r, q, c), (p, q, r)]
+    divided = [np.stack(corners, axis=1) for corners in pieces]
+    return np.vstack([faces[n_cut == 0], *divided])

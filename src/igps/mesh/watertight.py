@@ -181,11 +181,12 @@ def _discs(points: Floats, normals: Floats, radius: Floats) -> Surface:
     axis = np.eye(3)[smallest]
     u = unit(np.cross(normals, axis))
     v = unit(np.cross(normals, u))
-    angle = np.arange(6)[:, None] * np.pi / 3
-    circle = np.cos(angle) * u[:, None]
-    circle += np.sin(angle) * v[:, None]
-    rim = points[:, None] + radius[:, None, None] * circle
+    vertices = np.empty((len(points), 6, 3))
+    for corner in range(6):
+        angle = corner * np.pi / 3
+        arm = np.cos(angle) * u + np.sin(angle) * v
+        vertices[:, corner] = points + radius[:, None] * arm
     fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
     first = 6 * np.arange(len(points))
     faces = first[:, None, None] + fan
-    return rim.reshape(-1, 3), faces.reshape(-1, 3)
+    return vertices.reshape(-1, 3), faces.reshape(-1, 3)

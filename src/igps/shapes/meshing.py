@@ -106,7 +106,8 @@ def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
     margin = max(part.blend for part in body) + 2.5 * spacing
     low, high = _bounds(body)
     low = low - margin
-    n_steps = np.ceil((high + margin - low) / spacing)
+    size = high + margin - low
+    n_steps = np.ceil(size / spacing)
     shape = n_steps.astype(int) + 1
     x, y, z = (start + spacing * np.arange(n) for start, n in zip(low, shape, strict=True))
     grid = np.full(shape, 1e3)  # far outside

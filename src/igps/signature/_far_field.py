@@ -110,11 +110,12 @@ class HatSurface:
         the surface all rows are filled: with barycentric coordinates at the corners of its face, with zeros elsewhere.
         """
         n = x.shape[1]
-        near = np.zeros((len(hats) + 1, n), dtype=bool)
-        last_rows = out[len(out) - len(hats) :]
+        n_hats = len(hats)
+        near = np.zeros((n_hats + 1, n), dtype=bool)
+        last_rows = out[len(out) - n_hats :]
         fill_hats(x, hats, self.hats, ratio, last_rows, near)
-        row_of = np.full(len(self.order), len(hats))
-        row_of[hats] = np.arange(len(hats))
+        row_of = np.full(len(self.order), n_hats)
+        row_of[hats] = np.arange(n_hats)
         is_near = near[:-1].any(axis=1)
         near_hats = np.where(is_near, hats, -1)
         surface = (self.faces, self.table, self.face_starts, self.incident_faces)
@@ -122,9 +123,9 @@ class HatSurface:
         add_near_faces(x, near_hats, near, surface, row_of, last_rows, touched, pairs_for(n))
         on_surface = np.flatnonzero(touched.face_at >= 0)
         touched_faces = touched.face_at[on_surface]
-        corners = self.faces[touched_faces]
+        rows = row_of[self.faces[touched_faces]]
         out[:, on_surface] = 0
-        last_rows[row_of[corners], on_surface[:, None]] = touched.barycentric[on_surface]
+        last_rows[rows, on_surface[:, None]] = touched.barycentric[on_surface]
 
 
 def _face_table(corners: Floats) -> Floats:

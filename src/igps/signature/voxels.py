@@ -145,13 +145,13 @@ def _scan(
     votes = (after[1:] > 0).astype(np.int8)
     votes += before[:-1] > 0
 
-    on_surface = np.zeros(size, dtype=bool)
-    cell = _cell_size(axes, vertices)
+    on_surface = np.zeros(votes.shape, dtype=bool)
+    tolerance = _ON_SURFACE * _cell_size(axes, vertices)
     for neighbour in (position - 1, position):
         neighbour = np.clip(neighbour, 0, len(x_axis) - 1)
-        is_close = np.abs(x_axis[neighbour] - crossing) < _ON_SURFACE * cell
+        is_close = np.abs(x_axis[neighbour] - crossing) < tolerance
         on_surface[neighbour[is_close], column[is_close], row[is_close]] = True
-    return votes, on_surface[:-1]
+    return votes, on_surface
 
 
 def _crossings(
