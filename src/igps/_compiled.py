@@ -40,12 +40,10 @@ class Lazy:
     @property
     def dispatcher(self) -> Callable[..., Any]:
         """The Numba dispatcher; the same object for all threads."""
-        dispatcher = self.__dict__.get("_dispatcher")
-        return (
-            self.__dict__.setdefault("_dispatcher", self._make())
-            if dispatcher is None
-            else dispatcher
-        )
+        made: dict[str, Callable[..., Any]] = vars(self)
+        if "_dispatcher" not in made:
+            made.setdefault("_dispatcher", self._make())
+        return made["_dispatcher"]
 
 
 class Compiled(Lazy, Generic[Arguments, Result]):

@@ -212,9 +212,8 @@ def _blas_to_one_thread() -> Callable[[], None]:
 
 def _release_control() -> None:
     """Let other threads lift the limit. Since threadpoolctl 3.8, only the thread that set it may, while it is alive."""
-    clear = getattr(
-        getattr(threadpoolctl, "OpenBLASController", None), "clear_controlling_thread", None
-    )
+    controller = getattr(threadpoolctl, "OpenBLASController", None)
+    clear = getattr(controller, "clear_controlling_thread", None)
     if clear is not None:
         clear()
 

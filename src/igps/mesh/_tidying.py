@@ -348,10 +348,10 @@ def _solve_umbrella(fixed: Floats, faces: Integers, n_points: int, order: int) -
 
 def _fair(vertices: Floats, faces: Integers, n_old: int) -> Floats:
     """Move the vertices from `n_old` on so that the surface continues smoothly across the rim, like a thin plate."""
-    near = faces[(faces >= n_old).any(axis=1)]
+    is_near = (faces >= n_old).any(axis=1)
     for _ in range(2):
-        near = faces[np.isin(faces, near).any(axis=1)]
-    used, index = np.unique(near, return_inverse=True)
+        is_near = np.isin(faces, faces[is_near]).any(axis=1)
+    used, patch = np.unique(faces[is_near], return_inverse=True)
     fixed = vertices[used[used < n_old]]
-    free = _solve_umbrella(fixed, index.reshape(-1, 3), len(used), order=2)
+    free = _solve_umbrella(fixed, patch.reshape(-1, 3), len(used), order=2)
     return np.concatenate([vertices[:n_old], free])

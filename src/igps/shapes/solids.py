@@ -183,8 +183,8 @@ class Shell(Solid):
             dz = z1 - z0
             across = radial - r0
             up = z - z0
-            along = (across * dr + up * dz) / (dr * dr + dz * dz)
-            along = np.clip(along, 0.0, 1.0)
+            projected = across * dr + up * dz
+            along = np.clip(projected / (dr * dr + dz * dz), 0.0, 1.0)
             to_segment = (across - along * dr) ** 2 + (up - along * dz) ** 2
             squared = np.minimum(squared, to_segment)
         return np.sqrt(squared) - 0.5 * self.wall

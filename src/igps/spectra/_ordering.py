@@ -3,6 +3,7 @@
 This is the first step of a factorization, see `multifrontal`. Only the pattern of the matrix is read.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -28,10 +29,11 @@ def hop_coordinates(graph: sparse.csr_array, n_landmarks: int = 3) -> np.ndarray
     landmark = 0
     for _ in range(n_landmarks + 1):
         hops = dijkstra(unweighted, directed=False, indices=landmark, unweighted=True)
-        columns.append(np.where(np.isfinite(hops), hops, -1.0))
+        hops = np.where(np.isfinite(hops), hops, -1.0)
         # The first landmark is arbitrary. It is dropped once it has led to one at the far end.
-        columns = columns[-n_landmarks:]
-        landmark = int(np.min(columns, axis=0).argmax())
+        columns = [*columns, hops][-n_landmarks:]
+        nearest = np.min(columns, axis=0)
+        landmark = int(nearest.argmax())
     return np.stack(columns, axis=1)
 
 
@@ -72,7 +74,7 @@ def nested_dissection(
     one pass gives it for all positions.
     """
     n_vertices = graph.shape[0]
-    depth = max(0, int(np.ceil(np.log2(n_vertices / leaf_size))))
+    depth = max(0, math.ceil(math.log2(n_vertices / leaf_size)))
     orders = [np.argsort(column, kind="stable") for column in coordinates.T]
     indptr, indices = pattern(graph)
     scratch = _Scratch(
