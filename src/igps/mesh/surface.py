@@ -47,7 +47,7 @@ def sums(index: Integers, rows: Floats, n: int) -> Floats:
     return np.stack(columns, axis=1)
 
 
-def lengths(vectors: Floats) -> Floats:
+def lengths(vectors: NDArray[np.floating]) -> Floats:
     """Return the lengths (N,) of vectors (N, D)."""
     return np.linalg.norm(vectors, axis=1)
 

@@ -78,7 +78,7 @@ def in_canonical_order(mesh: Mesh) -> Mesh:
     return replace(mesh, vertices=mesh.vertices[order], faces=corners[ascending])
 
 
-def _keys(embedding: Floats, tie_breakers: Floats | float) -> Floats:
+def _keys(embedding: NDArray[np.floating], tie_breakers: Floats | float) -> Floats:
     keys = lengths(embedding) + _TIE_BREAKER_WEIGHT * tie_breakers
     anchor = int(np.argmax(keys))
     nearest = np.full(len(keys), np.inf)
