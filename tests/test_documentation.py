@@ -173,18 +173,24 @@ def runs_here(page):
     return page != "README.md" and any(block.title is None for block in python(page))
 
 
+def refused(*_):
+    raise AssertionError("a script that starts processes imports itself: n_workers=1, or __main__")
+
+
 @pytest.mark.parametrize("page", [page for page in TEXT if runs_here(page)])
-def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page, folder, capsys):
+def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page, folder, capsys, monkeypatch):
     code, expected = program(page, folder)
     assert code
     if "MDAnalysis" in code:
         pytest.importorskip("MDAnalysis", reason="reads frames of simulations")
     (folder / "page.py").write_text(code)
     # Where it starts processes, they import it; entry points are read once in a process
-    if "__main__" in code or any(folder.glob("*.dist-info")):
+    is_guarded = 'if __name__ == "__main__":' in code
+    if is_guarded or any(folder.glob("*.dist-info")):
         (folder / "cache").unlink()
         printed = run_alone(folder, "page.py")
     else:
+        monkeypatch.setattr("igps._parallel.WorkerPool", refused)
         runpy.run_path("page.py", run_name="__main__")
         printed = capsys.readouterr().out
     shown = iter(printed.splitlines())

@@ -84,6 +84,14 @@ def test_a_learned_layout_starts_as_the_fixed_one(name, batch):
         assert bool(parameter.grad.isfinite().all() and parameter.grad.any()), path
 
 
+@pytest.mark.parametrize("name", ["interior", "interior+size"])
+def test_samples_are_drawn_at_each_step_until_the_descriptor_is_evaluated(name, batch):
+    drawing = igps.descriptor(name, n_training_samples=20)
+    first = drawing(batch)
+    assert not torch.equal(drawing(batch), first)
+    assert torch.equal(drawing.eval()(batch), igps.descriptor(name)(batch))
+
+
 @pytest.mark.parametrize("part", PARTS)
 def test_only_what_is_named_is_learned(part):
     learned = igps.descriptor("interior", learnable=[part])

@@ -355,8 +355,8 @@ def residue_summaries(dataset: SignatureDataset) -> list[str]:
         match = _RESIDUES.fullmatch(note)
         if match is not None:
             counts.setdefault(match[2], []).append(int(match[1]))
-    n_bodies = len(dataset)
-    return [f"{sum(n):,} {text} (in {len(n)} of {n_bodies} bodies)" for text, n in counts.items()]
+    bodies = counted(len(dataset), "body")
+    return [f"{sum(n):,} {text} (in {len(n)} of {bodies})" for text, n in counts.items()]
 
 
 def write_mending_notes(path: Path, dataset: SignatureDataset) -> None:

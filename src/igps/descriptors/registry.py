@@ -61,7 +61,7 @@ def descriptor(
     learnable: bool | Collection[LayoutPart] = False,
     n_training_samples: int | None = None,
 ) -> Descriptor:
-    """Return a descriptor by its name or file, in evaluation mode; a descriptor is returned as it is.
+    """Return a descriptor by its name or file, in evaluation mode unless it draws samples; a descriptor as it is.
 
     Example:
         >>> descriptor("interior").requirements.n_eigenpairs
@@ -80,7 +80,7 @@ def descriptor(
         learnable: what of the layout is learned by gradients: any of "bins", "classes" and
             "filter", or True for all. Until it is trained, descriptions are the same.
         n_training_samples: number of samples of a body that are drawn at each step of training;
-            all that are used otherwise if None.
+            all that are used otherwise if None. With it, the descriptor is in training mode.
 
     Raises:
         ValueError: no descriptor has this name, or the file is not valid, see `load`; or the
@@ -100,6 +100,9 @@ def descriptor(
     base = _base_descriptor(which)
     if parts or n_training_samples is not None:
         base = with_layout(base, parts, n_training_samples)
+    draws_samples = n_training_samples is not None
+    if draws_samples:  # which it does in training mode, into which Lightning would not put it
+        base.train()
     compares_size = size == "keep" if units is None else keeps_size(size, units)[0]
     with_size = compares_size or SIZE in suffixes
     with_side = mirror == "distinct" or SIDE in suffixes
@@ -113,7 +116,7 @@ def descriptor(
         with_size = with_size or base.keeps_size
         with_side = with_side or base.twists is not None
         base = base.descriptor
-    return SizeAndSide(base, size=with_size, side=with_side, scale=scale).eval()
+    return SizeAndSide(base, size=with_size, side=with_side, scale=scale).train(draws_samples)
 
 
 def is_file(which: str | Path) -> bool:
