@@ -271,7 +271,8 @@ def test_an_item_is_asked_for_by_number_or_name(dataset):
         dataset[4]
     with pytest.raises(IndexError, match="mask: expected 4 entries, got an array of shape"):
         dataset[[True]]
-    with pytest.raises(KeyError, match="no body is called 'cat'"):
+    first = dataset.bodies.names[0]
+    with pytest.raises(KeyError, match=f"no body is called 'cat'; the first is called '{first}'"):
         dataset["cat"]
 
 

@@ -70,7 +70,8 @@ class Bodies:
     def number(self, name: str) -> int:
         """Return the index of a body by its name; raise a KeyError if there is no such body."""
         if name not in self.names:
-            raise KeyError(f"no body is called {name!r}; the first is called {self.names[:1]}")
+            first = f"the first is called {self.names[0]!r}" if self.names else "there is none"
+            raise KeyError(f"no body is called {name!r}; {first}")
         return self.names.index(name)
 
     def subset(self, indices: Sequence[int]) -> Bodies:
