@@ -549,6 +549,13 @@ def test_completed_residues_are_told_on_the_terminal(tmp_path, capsys):
     assert told in capsys.readouterr().out
 
 
+def test_notes_of_the_whole_are_not_told_of_a_range(tmp_path):
+    text = "".join(residue(i, "LYS", backbone()) for i in range(1, 10))
+    molecule = molecule_of(BodyRef(written(tmp_path, text), "A:2-3"))
+    completed = COMPLETED.format(9)
+    assert molecule.notes == (f"of 9 residues: {completed}", "residues 2-3 alone: 2 of 9")
+
+
 def test_ranges_of_residues_are_bodies(tmp_path):
     text = "".join(residue(i) for i in range(1, 9))
     text += "".join(residue(i, chain="B") for i in range(1, 4))

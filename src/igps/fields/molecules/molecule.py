@@ -56,6 +56,7 @@ class Molecule:
     def subset(self, is_kept: Booleans, note: str) -> Molecule:
         """Return the molecule of some of its residues, (R,), with a note of why."""
         balls = is_kept[self.residue_of]
+        of_all = [f"of {len(is_kept)} residues: {text}" for text in self.notes]
         new_index = np.cumsum(is_kept) - 1
         return replace(
             self,
@@ -68,7 +69,7 @@ class Molecule:
             b_factors=self.b_factors[is_kept],
             places=self.places[is_kept],
             residue_labels=tuple(compress(self.residue_labels, is_kept)),
-            notes=(*self.notes, note),
+            notes=(*of_all, note),
         )
 
     def __repr__(self) -> str:
