@@ -252,8 +252,8 @@ def _moved_words(movement: Movement) -> str:
     found = movement.correspondence
     steps = sorted(movement.superposition.distances)
     return (
-        f"{len(found.pairs)} {found.kind} correspond; painted: the square of how far they moved after superposition "
-        f"(median {steps[len(steps) // 2]:.2g}, largest {steps[-1]:.2g})"
+        f"{len(found.pairs)} {found.kind} correspond; after superposition they moved by "
+        f"{steps[len(steps) // 2]:.2g} (median), at most {steps[-1]:.2g}; painted: the square of this"
     )
 
 
