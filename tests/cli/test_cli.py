@@ -345,6 +345,13 @@ def test_extract_short_vectors(root, tmp_path, capsys):
         )
     assert "short: expected a descriptor of vectors, such as pretrained" in capsys.readouterr().err
     assert not (tmp_path / "none.npz").exists()
+    run(*common, "--short", "--size", "keep", "--out", tmp_path / "sized.csv")
+    assert "size.log_area to size.log_volume are no part of it" in capsys.readouterr().out
+    with (tmp_path / "sized.csv").open(newline="") as table:
+        row = next(csv.DictReader(table))
+    vector = [float(row[name]) for name in row if name.startswith("short.")]
+    assert np.linalg.norm(vector) == pytest.approx(1, abs=1e-5)
+    assert {"size.log_area", "size.log_volume"} < row.keys()
 
 
 def test_query_lists_the_nearest(root, tmp_path, capsys):

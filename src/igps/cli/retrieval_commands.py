@@ -127,7 +127,8 @@ def extract(
         meshes: mesh files, or one folder.
         out: file ending in .csv, .parquet or .npz; notes on repaired meshes are written beside it, to a file of the
             same name ending in .notes.csv.
-        short: write unit vectors of at most 256 numbers, for search engines that compare by the cosine (pretrained).
+        short: write unit vectors of at most 256 numbers, for search engines that compare by the cosine (pretrained);
+            where size or side counts, its numbers follow, see --size.
         wide: write one row per file, or per folder with one mask file per organ, and columns such as PART.volume_mm3
             for each of its bodies.
     """
@@ -179,12 +180,15 @@ def _write_features(out: Path, result: Described, short: bool, wide: bool) -> No
     from igps.descriptors.measures import Measures
 
     vectors = result.vectors(short).reshape(len(result.dataset), -1)
-    columns = [f"short.{i}" for i in range(vectors.shape[1])]
-    if not short:
-        columns = result.descriptor.column_names(vectors.shape[1])
+    columns = result.descriptor.column_names(result.descriptions[0].numel())
+    beside: list[str] = []
+    if short:
+        beside = [name for name in columns if name.startswith(("side.", "size."))]
+        columns = [f"short.{i}" for i in range(vectors.shape[1] - len(beside))]
     if isinstance(result.descriptor, Measures):  # whose numbers every table has, in their units
         columns = []
-    metadata, measured = feature_table(result.dataset, vectors[:, : len(columns)], columns)
+    names = [*columns, *beside]
+    metadata, measured = feature_table(result.dataset, vectors[:, : len(names)], names)
     table: Table = {**metadata, **measured}
     if wide:
         table = wide_table(metadata, measured)
@@ -198,6 +202,8 @@ def _write_features(out: Path, result: Described, short: bool, wide: bool) -> No
             how = "the cosine"
         whole = f"{columns[0]} to {columns[-1]}"
         print(f"{whole} are one vector: compare it by {how}, and not column by column")
+    if beside:
+        print(f"{beside[0]} to {beside[-1]} are no part of it: --size ignore leaves size out")
 
 
 def query(
