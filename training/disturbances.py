@@ -30,9 +30,10 @@ def noise(mesh: Mesh, amplitude: float = 0.005, seed: int = 0) -> Mesh:
     """
     if not amplitude > 0:
         raise ValueError(f"amplitude: expected a positive share of the diagonal, got {amplitude}.")
-    lengths = np.random.default_rng(seed).normal(0, amplitude * mesh.diagonal, len(mesh.vertices))
-    note = f"every vertex moved along its normal, standard deviation {amplitude:g} of the bounding box diagonal"
+    generator = np.random.default_rng(seed)
+    lengths = generator.normal(0, amplitude * mesh.diagonal, len(mesh.vertices))
     steps = lengths[:, None] * vertex_normals(mesh.vertices, mesh.faces)
+    note = f"every vertex moved along its normal, standard deviation {amplitude:g} of the bounding box diagonal"
     return _changed(mesh, mesh.vertices + steps, mesh.faces, note)
 
 
@@ -43,7 +44,8 @@ def simplified(mesh: Mesh, share: float) -> Mesh:
         MeshError: the share cannot be reached.
     """
     _check_share(share)
-    return simplify(mesh, max(round(share * len(mesh.vertices)), 4))
+    n_vertices = round(share * len(mesh.vertices))
+    return simplify(mesh, max(n_vertices, 4))
 
 
 def remesh(mesh: Mesh) -> Mesh:
@@ -58,20 +60,20 @@ def remesh(mesh: Mesh) -> Mesh:
     """
     import igl
 
+    n_faces = len(mesh.faces)
     old_vertices = np.asfortranarray(mesh.vertices)
     old_faces = np.asfortranarray(mesh.faces)
-    vertices, faces = igl.upsample(old_vertices, np.asfortranarray(mesh.faces.astype(np.int32)))
-    vertices, faces, *_ = igl.decimate(
-        np.asfortranarray(vertices), np.asfortranarray(faces.astype(np.int32)), len(mesh.faces)
-    )
-    if len(faces) > len(mesh.faces):
+    vertices, faces = igl.upsample(old_vertices, np.asfortranarray(old_faces, dtype=np.int32))
+    vertices = np.asfortranarray(vertices)
+    faces = np.asfortranarray(faces, dtype=np.int32)
+    vertices, faces, *_ = igl.decimate(vertices, faces, n_faces)
+    if len(faces) > n_faces:
         raise MeshError(
-            f"{mesh.name}: could not be remeshed with {len(mesh.faces)} faces without a change of topology "
+            f"{mesh.name}: could not be remeshed with {n_faces} faces without a change of topology "
             f"(got {len(faces)})."
         )
-    _, _, vertices = igl.point_mesh_squared_distance(
-        np.asfortranarray(vertices), old_vertices, old_faces
-    )
+    vertices = np.asfortranarray(vertices)
+    _, _, vertices = igl.point_mesh_squared_distance(vertices, old_vertices, old_faces)
     note = "remeshed: every face cut into four, then the shortest edges collapsed"
     return _changed(mesh, vertices, faces, note)
 
@@ -91,24 +93,31 @@ def hole(mesh: Mesh, share: float = 0.01, seed: int = 0) -> Mesh:
         ValueError: `share` is out of range.
     """
     _check_share(share)
-    area = face_areas(mesh.vertices, mesh.faces)
-    middle = np.random.default_rng(seed).choice(len(area), p=area / area.sum())
+    areas = face_areas(mesh.vertices, mesh.faces)
+    area = areas.sum()
+    middle = np.random.default_rng(seed).choice(len(areas), p=areas / area)
     from_corners = dijkstra(edge_graph(mesh), indices=mesh.faces[middle])
-    away = from_corners.mean(axis=0)[mesh.faces].mean(axis=1)
+    at_vertices = from_corners.mean(axis=0)
+    away = at_vertices[mesh.faces].mean(axis=1)
     order = np.argsort(away, kind="stable")
-    is_within = np.cumsum(area[order]) <= share * area.sum()
+    is_within = np.cumsum(areas[order]) <= share * area
     n_removed = max(int(is_within.sum()), 1)
     while True:
         kept = np.delete(mesh.faces, order[:n_removed], axis=0)
         used, faces = np.unique(kept, return_inverse=True)
         faces = faces.reshape(-1, 3)
-        if n_removed == 1 or components(faces, len(used))[0] == 1:
+        n_pieces = components(faces, len(used))[0]
+        if n_removed == 1 or n_pieces == 1:
             break
         n_removed //= 2
-    lost = 1 - face_areas(mesh.vertices, kept).sum() / area.sum()
-    note = f"a hole of {len(mesh.faces) - len(kept)} faces, {lost:.2%} of the area"
+    lost = 1 - face_areas(mesh.vertices, kept).sum() / area
+    note = f"a hole of {n_removed} faces, {lost:.2%} of the area"
     return replace(
-        mesh, vertices=mesh.vertices[used], faces=faces, allow_open=True, notes=(*mesh.notes, note)
+        mesh,
+        vertices=mesh.vertices[used],
+        faces=faces,
+        allow_open=True,
+        notes=(*mesh.notes, note),
     )
 
 
@@ -129,16 +138,16 @@ def clip(mesh: Mesh, share: float = 0.1) -> Mesh:
     _check_share(share)
     import manifold3d
 
-    area = face_areas(mesh.vertices, mesh.faces)
-    centre = np.average(mesh.vertices[mesh.faces].mean(axis=1), axis=0, weights=area)
+    areas = face_areas(mesh.vertices, mesh.faces)
+    middles = mesh.vertices[mesh.faces].mean(axis=1)
+    centre = np.average(middles, axis=0, weights=areas)
     points = mesh.vertices - centre
     distance = np.linalg.norm(points, axis=1)
     direction = points[np.argmax(distance)] / distance.max()
     along = points @ direction
     cut = along.max() - share * np.ptp(along)
-    body = manifold3d.Manifold(
-        manifold3d.Mesh64(np.ascontiguousarray(points), mesh.faces.astype(np.uint64))
-    )
+    surface = manifold3d.Mesh64(np.ascontiguousarray(points), mesh.faces.astype(np.uint64))
+    body = manifold3d.Manifold(surface)
     if body.status() != manifold3d.Error.NoError:
         raise MeshError(
             f"{mesh.name}: manifold3d does not accept the surface ({body.status()}), so it was not cut."
@@ -148,7 +157,8 @@ def clip(mesh: Mesh, share: float = 0.1) -> Mesh:
         raise MeshError(f"{mesh.name}: nothing remains when the farthest {share:.0%} are cut off.")
     piece = max(pieces, key=lambda x: x.volume()).to_mesh64()
     faces = np.asarray(piece.tri_verts, dtype=np.int64)
-    result = _changed(mesh, np.asarray(piece.vert_properties)[:, :3] + centre, faces, "clipped")
+    vertices = np.asarray(piece.vert_properties)[:, :3] + centre
+    result = _changed(mesh, vertices, faces, "clipped")
     lost = 1 - result.volume / mesh.volume
     note = f"the farthest {share:.0%} of its extent cut off and capped, {lost:.2%} of the volume"
     return replace(result, notes=(*mesh.notes, note))
@@ -169,9 +179,10 @@ def move(mesh: Mesh, seed: int = 0) -> Mesh:
     generator = np.random.default_rng(seed)
     rotation = Rotation.from_quat(generator.standard_normal(4))
     direction = generator.standard_normal(3)
-    centre = mesh.vertices.mean(axis=0)
     offset = 2 * mesh.diagonal * direction / np.linalg.norm(direction)
-    moved = rotation.apply(mesh.vertices - centre) + centre + offset
+    centre = mesh.vertices.mean(axis=0)
+    turned = rotation.apply(mesh.vertices - centre)
+    moved = turned + centre + offset
     return _changed(mesh, moved, mesh.faces, "turned and moved")
 
 

@@ -290,11 +290,10 @@ def test_only_a_reflection_lays_a_chiral_part_onto_its_mirror_image():
     one = part()
     assert one.surface is not None
     surface = one.surface()
-    vertices, faces = surface._triangles
     mirror = np.array([-1.0, 1.0, 1.0])
     mirrored = TriangleSurface(
-        vertices * mirror,
-        np.ascontiguousarray(faces[:, ::-1]),
+        surface._vertices * mirror,
+        np.ascontiguousarray(surface._faces[:, ::-1]),
     )
     other = SurfaceSamples.of(one.points * mirror, one.normals * mirror, 1.0)
     other = replace(other, surface=lambda: mirrored)

@@ -50,7 +50,8 @@ def feature_table(
         "class": bodies.labels or [None] * len(bodies),
     }
     measured = _plain_numbers(dataset)
-    measured |= {name: list(column) for name, column in zip(columns, vectors.T, strict=True)}
+    for name, column in zip(columns, vectors.T, strict=True):
+        measured[name] = list(column)
     last: dict[str, Sequence[Any]] = {
         "unit": dataset.units(),
         **_border_columns(dataset),
@@ -59,20 +60,24 @@ def feature_table(
     reserved = {"folder", *own, *last, *measured}
     further = {}
     for name, values in bodies.columns.items():
-        further[f"{name} of {LABELS_FILE}" if name in reserved else name] = values
+        title = f"{name} of {LABELS_FILE}" if name in reserved else name
+        further[title] = values
     return {**own, **further, **last}, measured
 
 
 def _border_columns(dataset: SignatureDataset) -> dict[str, Sequence[Any]]:
     """Return which share of each surface lies at the border of the image, and at which sides."""
-    borders = [border_of(notes) for notes in dataset.all_notes()]
-    is_from_voxels = ["voxel_volume" in row for row in dataset.measures()]
-    whole = [0.0 if known else None for known in is_from_voxels]
-    shares = [
-        share if border is None else border.share
-        for border, share in zip(borders, whole, strict=True)
-    ]
-    sides = [None if border is None else border.sides for border in borders]
+    shares: list[float | None] = []
+    sides: list[str | None] = []
+    for notes, measures in zip(dataset.all_notes(), dataset.measures(), strict=True):
+        border = border_of(notes)
+        if border is not None:
+            shares.append(border.share)
+            sides.append(border.sides)
+        else:
+            is_from_voxels = "voxel_volume" in measures
+            shares.append(0.0 if is_from_voxels else None)
+            sides.append(None)
     return {"at_border": shares, "border_sides": sides}
 
 
@@ -80,18 +85,20 @@ def _plain_numbers(dataset: SignatureDataset) -> dict[str, Sequence[Any]]:
     """Return a column for each measure, None where a body has none; the name of a column ends with its unit."""
     units = dataset.units()
     known = [unit for unit in units if unit is not None and unit in MILLIMETRES]
-    is_known = len(known) == len(units)
-    is_mixed = is_known and len(set(known)) > 1
-    suffix = ""
-    if is_known:
-        suffix = "mm" if is_mixed else _WRITTEN.get(known[0], known[0])
+    shown = ""
+    lengths = [1.0] * len(units)
+    if len(known) == len(units):
+        shown = _WRITTEN.get(known[0], known[0])
+        if len(set(known)) > 1:
+            shown = "mm"
+            lengths = [millimetres(unit) for unit in known]
     rows = dataset.measures()
     columns: dict[str, Sequence[Any]] = {}
     for name, power in POWERS.items():
-        factors = [millimetres(unit) ** power if is_mixed else 1.0 for unit in units]
-        pairs = zip(rows, factors, strict=True)
-        values = [row[name] * factor if name in row else None for row, factor in pairs]
-        columns[name + _unit_suffix(suffix, power)] = values
+        values = []
+        for row, length in zip(rows, lengths, strict=True):
+            values.append(row[name] * length**power if name in row else None)
+        columns[name + _unit_suffix(shown, power)] = values
     return columns
 
 
@@ -121,16 +128,18 @@ def wide_table(metadata: Table, measured: Table) -> Table:
         rows.setdefault(row, {})[part] = i
     table: dict[str, Sequence[Any]] = {}
     per_body: dict[str, Sequence[Any]] = {}
-    for name in [name for name in metadata if name not in ("part", "name")]:
-        shared = [{metadata[name][i] for i in bodies.values()} for bodies in rows.values()]
-        is_shared = name not in _OF_BODIES and all(len(values) == 1 for values in shared)
-        if is_shared:
-            table[name] = [values.pop() for values in shared]
+    for name, column in metadata.items():
+        if name in ("part", "name"):
+            continue
+        values = [{column[i] for i in bodies.values()} for bodies in rows.values()]
+        if name in _OF_BODIES or any(len(own) > 1 for own in values):
+            per_body[name] = column
         else:
-            per_body[name] = metadata[name]
+            table[name] = [own.pop() for own in values]
+    per_body |= measured
     for part in sorted(set(metadata["part"]), key=str):
         indices = [bodies.get(part) for bodies in rows.values()]
-        for name, column in {**per_body, **measured}.items():
+        for name, column in per_body.items():
             title = name if part is None else f"{part}.{name}"
             table[title] = [None if i is None else column[i] for i in indices]
     return table
@@ -138,20 +147,22 @@ def wide_table(metadata: Table, measured: Table) -> Table:
 
 def _with_rows(metadata: Table) -> Table:
     """Return metadata with the column that names the row of each body: its file, or its folder."""
-    folders = [PurePath(file).parent.as_posix() for file in metadata["file"]]
+    files = metadata["file"]
     parts = metadata["part"]
+    folders = [PurePath(file).parent.as_posix() for file in files]
     n = len(parts)
     n_different = len(set(parts))
-    has_one_body_per_file = len(set(metadata["file"])) == n
-    has_one_part_per_folder = len(set(zip(folders, parts, strict=True))) == n
     is_named_by_file = all(map(is_named_after_file, metadata["name"], parts))
     if is_named_by_file and all(part and part.isdigit() for part in parts):
         return {**metadata, "part": [None] * n}
+    has_one_body_per_file = len(set(files)) == n
+    has_one_part_per_folder = len(set(zip(folders, parts, strict=True))) == n
     is_mask_of_organ = has_one_body_per_file and has_one_part_per_folder and n_different > 1
-    if is_mask_of_organ and (n > n_different or is_named_by_file):
-        others = {name: metadata[name] for name in metadata if name != "file"}
-        return {"folder": folders, **others}
-    return metadata
+    if not is_mask_of_organ or (n == n_different and not is_named_by_file):
+        return metadata
+    table = {"folder": folders, **metadata}
+    del table["file"]
+    return table
 
 
 def write_table(path: Path, table: Table) -> None:
@@ -165,12 +176,13 @@ def write_table(path: Path, table: Table) -> None:
             ) from error
         arrays = {name: pyarrow.array(_typed(name, values)) for name, values in table.items()}
         pyarrow.parquet.write_table(pyarrow.table(arrays), path)
-    else:
-        write_rows(path, table, zip(*table.values(), strict=True))
+        return
+    write_rows(path, table, zip(*table.values(), strict=True))
 
 
 def _typed(column: str, values: Sequence[Any]) -> list[Any]:
     """Return a column of labels.csv as floats if all values are numbers; names stay strings even if they are digits."""
-    if column.rpartition(".")[2] not in _TEXT_COLUMNS and all(map(is_number, values)):
-        return [None if value is None else float(value) for value in values]
-    return list(values)
+    _, _, name = column.rpartition(".")  # behind that of a part
+    if name in _TEXT_COLUMNS or not all(map(is_number, values)):
+        return list(values)
+    return [None if value is None else float(value) for value in values]

@@ -24,7 +24,8 @@ _GAP = 2.5  # lateral distance of the nearest sample that does not count, in ste
 # Principal axes whose extents differ by a smaller factor are ambiguous: starts from other rotations are tried as well
 _AMBIGUITY = 1.1
 _N_ROTATIONS = 300
-_N_SCORED, _N_FITTED = 60, 250  # samples
+_N_SCORED = 60  # samples that score a start
+_N_FITTED = 250  # samples that are fitted
 _N_STARTS = 12
 _N_COARSE_STEPS = 6
 _N_FINE_STEPS = 4
@@ -40,8 +41,10 @@ _PATCH_SIZE = 10  # neighbouring samples whose offsets are averaged
 # edge. In between it may be either.
 _BENDS = (1.0, 30.0, 60.0)
 # Flat faces tell whether a body was changed if they have this share of the samples, and half of these lie nearer than
-# the tolerance over _COINCIDING. The alignment is improved _N_TRIMMED times.
-_MIN_FLAT, _COINCIDING, _N_TRIMMED = 0.1, 5.0, 3
+# the tolerance over _COINCIDING.
+_MIN_FLAT = 0.1
+_COINCIDING = 5.0
+_N_TRIMMED = 3  # improvements of the alignment by the half that fits best
 _PLAY = 2.0  # times the play of both surfaces by which round places may lie apart
 MAX_LOG_SCALE = math.log(1.1)
 """Largest logarithm of the scale of an alignment."""
@@ -61,17 +64,12 @@ class SurfaceSamples:
     @classmethod
     def of(cls, points: Floats, normals: NDArray[np.floating], area: float) -> SurfaceSamples:
         """Normalise points (P, 3), a length, with outward normals (P, 3), by the area of the surface, a length²."""
-        if (
-            points.shape != normals.shape
-            or points.ndim != 2
-            or points.shape[1] != 3
-            or len(points) < 4
-        ):
+        n = len(points)
+        if n < 4 or points.shape != (n, 3) or normals.shape != (n, 3):
             shapes = f"{tuple(points.shape)} and {tuple(normals.shape)}"
             raise ValueError(f"points, normals: expected both (P, 3) with P ≥ 4, got {shapes}.")
-        return cls(
-            (points - points.mean(axis=0)) / math.sqrt(area), np.asarray(normals, dtype=np.float64)
-        )
+        centred = points - points.mean(axis=0)
+        return cls(centred / math.sqrt(area), np.asarray(normals, dtype=np.float64))
 
     @cached_property
     def tree(self) -> KDTree:
@@ -89,9 +87,13 @@ class SurfaceSamples:
         """Typical distance of neighbouring samples."""
         return 1 / math.sqrt(len(self.points))
 
+    def finest(self) -> SurfaceSamples | TriangleSurface:
+        """Return the surface itself, or the samples if it is not known."""
+        return self if self.surface is None else self.surface()
+
     def nearest(self, samples: SurfaceSamples) -> tuple[Floats, Floats]:
         """Return points and normals of these samples: the nearest, with similar normals, to each of the given ones."""
-        nearest = self.tree.query(_with_normals(samples))[1]
+        _, nearest = self.tree.query(_with_normals(samples))
         return self.points[nearest], self.normals[nearest]
 
 
@@ -103,17 +105,22 @@ class TriangleSurface:
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         import igl
 
-        self._triangles = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
+        self._vertices = np.ascontiguousarray(vertices)
+        self._faces = np.ascontiguousarray(faces)
         self._normals = unit(area_vectors(vertices, faces))
         self._tree = igl.AABB()
-        self._tree.init(*self._triangles)
+        self._tree.init(self._vertices, self._faces)
 
     def nearest(self, samples: SurfaceSamples) -> tuple[Floats, Floats]:
         """Return the nearest point of the surface to each of the samples (P), and the normal there."""
-        _, face, points = self._tree.squared_distance(
-            *self._triangles, np.ascontiguousarray(samples.points)
-        )
-        return np.asarray(points), self._normals[np.asarray(face).ravel()]
+        face, points = self._nearest(samples)
+        return points, self._normals[face]
+
+    def _nearest(self, samples: SurfaceSamples) -> tuple[Integers, Floats]:
+        """Return the face (P,) nearest to each of the samples, and its nearest point (P, 3)."""
+        points = np.ascontiguousarray(samples.points)
+        _, face, nearest = self._tree.squared_distance(self._vertices, self._faces, points)
+        return np.asarray(face).ravel(), np.asarray(nearest)
 
     def play_at(self, samples: SurfaceSamples) -> Floats:
         """Return how far (P,) the round surface behind the nearest triangles may lie from them: 0 on flat faces.
@@ -121,27 +128,28 @@ class TriangleSurface:
         Bends of a few degrees are those of a round surface. An arc whose chords are w wide and bend by β lies up to
         w/2 · tan(β/4) off them. Bends of more degrees may be edges or coarse arcs: infinity.
         """
-        points = np.ascontiguousarray(samples.points)
-        _, face, _ = self._tree.squared_distance(*self._triangles, points)
-        return self._play[np.asarray(face).ravel()]
+        face, _ = self._nearest(samples)
+        return self._play[face]
 
     @cached_property
     def _play(self) -> Floats:
-        vertices, faces = self._triangles
-        edges, edge_of_side = undirected_edges(faces)
-        lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+        edges, edge_of_side = undirected_edges(self._faces)
         count = np.bincount(edge_of_side, minlength=len(edges))
+        is_between_two = count == 2
         sides = np.argsort(edge_of_side, kind="stable")
-        starts = (np.cumsum(count) - count)[count == 2]
+        starts = (np.cumsum(count) - count)[is_between_two]
         pairs = np.stack([sides[starts], sides[starts + 1]]) // 3  # the two faces (2, E) of edges
         cosines = np.einsum("ei,ei->e", *self._normals[pairs])
         bends = np.arccos(np.clip(cosines, -1, 1))
-        flat, round_, arc = np.radians(_BENDS)
-        widths = 2 * face_areas(vertices, faces)[pairs] / np.maximum(lengths[count == 2], 1e-12)
+        start, end = edges[is_between_two].T
+        lengths = np.linalg.norm(self._vertices[start] - self._vertices[end], axis=1)
+        areas = face_areas(self._vertices, self._faces)
+        widths = 2 * areas[pairs] / np.maximum(lengths, 1e-12)
         play = widths / 2 * np.tan(bends / 4)
+        flat, round_, arc = np.radians(_BENDS)
         play[:, bends > round_] = np.inf
         play[:, (bends < flat) | (bends > arc)] = 0.0
-        largest = np.zeros(len(faces))
+        largest = np.zeros(len(self._faces))
         np.maximum.at(largest, pairs, play)
         return largest
 
@@ -187,14 +195,11 @@ def surface_distance(
     is_ambiguous = min(_min_extent_ratio(one), _min_extent_ratio(other)) < _AMBIGUITY
     samples = _subset(one, _N_FITTED)
     for starts in _starts(one, other, side):
-        order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")[
-            :_N_STARTS
-        ]
-        coarse = [_fit(samples, other, _Alignment(starts[i]), _N_COARSE_STEPS) for i in order]
-        distance = min(coarse, key=itemgetter(0))[0]
+        coarse = _coarse_fits(one, other, starts)
+        distance, _ = min(coarse, key=itemgetter(0))
         if distance <= hopeless:
             # Samples alone cannot tell which turn of a spring fits another turn: the surface itself decides
-            finest = other if other.surface is None else other.surface()
+            finest = other.finest()
             close = [alignment for error, alignment in coarse if error <= _CLOSE_FIT * distance]
             fine = [_fit(samples, finest, alignment, _N_FINE_STEPS) for alignment in close]
             distance, alignment = min(fine, key=itemgetter(0))
@@ -203,9 +208,20 @@ def surface_distance(
         best = min(best, distance)
         # A body may nearly be its own mirror image, so a small distance need not be the smallest. For surfaces known to
         # be the same, unambiguous axes are enough.
-        if best <= stop_at or ((best > hopeless or patch_size == 1) and not is_ambiguous):
+        are_axes_enough = not is_ambiguous and (best > hopeless or patch_size == 1)
+        if best <= stop_at or are_axes_enough:
             break
     return best
+
+
+def _coarse_fits(
+    one: SurfaceSamples, other: SurfaceSamples, starts: Floats
+) -> list[tuple[float, _Alignment]]:
+    """Return the distances and alignments of samples from the best of the starts (S, 3, 3)."""
+    scores = _scores(_subset(one, _N_SCORED), other, starts)
+    best = np.argsort(scores, kind="stable")[:_N_STARTS]
+    samples = _subset(one, _N_FITTED)
+    return [_fit(samples, other, _Alignment(starts[i]), _N_COARSE_STEPS) for i in best]
 
 
 def _starts(one: SurfaceSamples, other: SurfaceSamples, side: Side) -> list[Floats]:
@@ -228,14 +244,11 @@ def changed_share(one: SurfaceSamples, other: SurfaceSamples, tolerance: float) 
     if surface is None or one.surface is None:
         return 0.0
     target = surface()
+    few = _subset(one, _N_FITTED)
     fits = []
     for starts in _starts(one, other, "any"):
-        order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")
-        few = _subset(one, _N_FITTED)
-        coarse = [
-            _fit(few, other, _Alignment(starts[i]), _N_COARSE_STEPS) for i in order[:_N_STARTS]
-        ]
-        fits += [_fit(few, target, alignment, _N_FINE_STEPS) for _, alignment in coarse]
+        for _, alignment in _coarse_fits(one, other, starts):
+            fits.append(_fit(few, target, alignment, _N_FINE_STEPS))
     _, alignment = min(fits, key=itemgetter(0))
     for _ in range(_N_TRIMMED):
         apart = np.linalg.norm(_offsets(alignment(one), target), axis=1)
@@ -246,9 +259,12 @@ def changed_share(one: SurfaceSamples, other: SurfaceSamples, tolerance: float) 
     play = one.surface().play_at(one) + target.play_at(moved)
     apart = np.linalg.norm(_offsets(moved, target), axis=1)
     on_flat = apart[play == 0]
-    if len(on_flat) < _MIN_FLAT * len(apart) or np.median(on_flat) > tolerance / _COINCIDING:
+    if len(on_flat) < _MIN_FLAT * len(apart):
         return 0.0
-    return float((apart > tolerance + _PLAY * play).mean())
+    if np.median(on_flat) > tolerance / _COINCIDING:
+        return 0.0
+    is_apart = apart > tolerance + _PLAY * play
+    return float(is_apart.mean())
 
 
 def offset_in_place(samples: SurfaceSamples, surface: TriangleSurface) -> float:
@@ -264,22 +280,29 @@ def _two_way_distance(
     max_distance: float,
 ) -> float:
     """Return the root mean square over the patches of both surfaces, or a lower bound of it above `max_distance`."""
-    squares = []
+    total = 0.0
     for samples, target, initial in ((one, other, alignment), (other, one, alignment.inverse())):
-        finest = target if target.surface is None else target.surface()
+        finest = target.finest()
         if max_distance < math.inf:
-            bound = (
-                math.sqrt(_mean_square(initial(samples), finest, patch_size) / initial.scale)
-                - _LAST_GAIN
-            )
+            now = math.sqrt(_square_after(initial, samples, finest, patch_size))
+            bound = now - _LAST_GAIN
             if bound > max_distance:
                 return bound
         _, fitted = _fit(samples, finest, initial, _N_LAST_STEPS)
-        # In the unit of the geometric mean of both, so that neither is favoured
-        squares.append(_mean_square(fitted(samples), finest, patch_size) / fitted.scale)
-        if sum(squares) / 2 > max_distance**2:
+        total += _square_after(fitted, samples, finest, patch_size)
+        if total / 2 > max_distance**2:
             break
-    return math.sqrt(sum(squares) / 2)
+    return math.sqrt(total / 2)
+
+
+def _square_after(
+    alignment: _Alignment,
+    samples: SurfaceSamples,
+    target: SurfaceSamples | TriangleSurface,
+    patch_size: int,
+) -> float:
+    """Return the mean square after an alignment, in the unit of the geometric mean of both, which favours neither."""
+    return _mean_square(alignment(samples), target, patch_size) / alignment.scale
 
 
 def _mean_square(
@@ -287,7 +310,7 @@ def _mean_square(
 ) -> float:
     """Return the mean square offset of patches, or the largest square offset if a patch is one sample."""
     ranks = np.arange(1, min(patch_size, len(samples.points)) + 1)
-    neighbours = samples.tree.query(_with_normals(samples), k=ranks)[1]
+    _, neighbours = samples.tree.query(_with_normals(samples), k=ranks)
     means = _offsets(samples, target)[neighbours].mean(axis=1)
     squares = np.einsum("ni,ni->n", means, means)
     return float(squares.max() if patch_size == 1 else squares.mean())
@@ -297,21 +320,23 @@ def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) 
     """Return the offsets (P, 3) from samples to the surface of the target."""
     nearest, normals = target.nearest(samples)
     steps = nearest - samples.points
-    normal_part = np.einsum("ni,ni->n", steps, normals)[:, None] * normals
+    heights = np.einsum("ni,ni->n", steps, normals)
+    normal_part = heights[:, None] * normals
     lateral = steps - normal_part
     length = np.linalg.norm(lateral, axis=1, keepdims=True)
-    return normal_part + lateral * np.maximum(1 - _GAP * target.gap / np.maximum(length, 1e-12), 0)
+    beyond_gap = np.maximum(1 - _GAP * target.gap / np.maximum(length, 1e-12), 0)
+    return normal_part + lateral * beyond_gap
 
 
 def _scores(samples: SurfaceSamples, target: SurfaceSamples, starts: Floats) -> Floats:
     """Return the mean square distance (S,) of the samples from the target after each of the rotations (S, 3, 3)."""
-    points, normals = (
-        np.einsum("sij,nj->sni", starts, array) for array in (samples.points, samples.normals)
-    )
+    points = np.einsum("sij,nj->sni", starts, samples.points)
+    normals = np.einsum("sij,nj->sni", starts, samples.normals)
     rotated = SurfaceSamples(points.reshape(-1, 3), normals.reshape(-1, 3))
     # Precise enough to order the starts
     distances, _ = target.tree.query(_with_normals(rotated), eps=0.5)
-    return np.asarray(np.square(distances).reshape(len(starts), -1).mean(axis=1))
+    squares = np.square(distances).reshape(len(starts), -1)
+    return np.asarray(squares.mean(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,9 +359,9 @@ class _Alignment:
         """Compose with a small step (7,): a rotation vector, a shift, and the logarithm of a scale."""
         rotation = Rotation.from_rotvec(step[:3]).as_matrix()
         log_scale = np.clip(math.log(self.scale) + step[6], -MAX_LOG_SCALE, MAX_LOG_SCALE)
-        factor = math.exp(log_scale) / self.scale
-        shift = factor * rotation @ np.broadcast_to(self.shift, 3) + step[3:6]
-        return _Alignment(rotation @ self.rotation, shift, math.exp(log_scale))
+        scale = math.exp(log_scale)
+        moved = scale / self.scale * rotation @ np.broadcast_to(self.shift, 3)
+        return _Alignment(rotation @ self.rotation, moved + step[3:6], scale)
 
 
 def _fit(
@@ -360,7 +385,8 @@ def _fit(
         if np.abs(step).max() < 1e-5:
             break
     offsets = _offsets(alignment(samples), target)
-    return float(np.sqrt(np.einsum("ni,ni->n", offsets, offsets).mean())), alignment
+    squares = np.einsum("ni,ni->n", offsets, offsets)
+    return float(np.sqrt(squares.mean())), alignment
 
 
 def _with_normals(samples: SurfaceSamples) -> Floats:
@@ -369,20 +395,18 @@ def _with_normals(samples: SurfaceSamples) -> Floats:
 
 def _subset(samples: SurfaceSamples, n: int) -> SurfaceSamples:
     """Return about n of the samples, at equal steps."""
-    chosen = (
-        np.linspace(0, len(samples.points) - 1, min(n, len(samples.points)))
-        .round()
-        .astype(np.int64)
-    )
+    n_all = len(samples.points)
+    steps = np.linspace(0, n_all - 1, min(n, n_all))
+    chosen = steps.round().astype(np.int64)
     return SurfaceSamples(samples.points[chosen], samples.normals[chosen])
 
 
 def _principal_starts(one: SurfaceSamples, other: SurfaceSamples) -> Floats:
     """Return the maps (8, 3, 3) of principal axes onto principal axes, with every choice of signs."""
-    axes, other_axes = (np.linalg.eigh(np.cov(samples.points.T))[1] for samples in (one, other))
-    return np.stack(
-        [other_axes @ np.diag(signs) @ axes.T for signs in product((1.0, -1.0), repeat=3)]
-    )
+    _, axes = np.linalg.eigh(np.cov(one.points.T))
+    _, other_axes = np.linalg.eigh(np.cov(other.points.T))
+    all_signs = product((1.0, -1.0), repeat=3)
+    return np.stack([other_axes @ np.diag(signs) @ axes.T for signs in all_signs])
 
 
 def _min_extent_ratio(samples: SurfaceSamples) -> float:

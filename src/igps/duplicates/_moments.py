@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from igps._arrays import Floats, Integers
+from igps._arrays import Floats, Integers, Surface
 from igps.duplicates._alignment import MAX_LOG_SCALE
 from igps.mesh.surface import area_vectors, directed_edges, face_areas
 
 # Quadrature with six nodes, exact for polynomials of degree four on a triangle (Dunavant 1985)
-_INNER, _OUTER = 0.445948490915965, 0.091576213509771
+_INNER = 0.445948490915965
+_OUTER = 0.091576213509771
 # Barycentric
 _NODES = np.concatenate([np.full((3, 3), x) + np.eye(3) * (1 - 3 * x) for x in (_INNER, _OUTER)])
 _WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
@@ -30,23 +31,14 @@ def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
     the map. It holds for moves up to `max_move`, and ignores a scaling by up to a tenth. If the moments are not those
     of a solid, the map and thus the bound are zero. Holes of an open surface are closed by cones over its centroid.
     """
-    start, end = directed_edges(faces)
-    is_open = ~np.isin(start * len(vertices) + end, end * len(vertices) + start)
-    if is_open.any():
-        centroid = np.average(
-            vertices[faces].mean(axis=1), axis=0, weights=face_areas(vertices, faces)
-        )
-        cones = np.column_stack(
-            [end[is_open], start[is_open], np.full(is_open.sum(), len(vertices))]
-        )
-        vertices = np.vstack([vertices, centroid])
-        faces = np.vstack([faces, cones])
+    vertices, faces = _closed(vertices, faces)
     vectors = area_vectors(vertices, faces)
     x = np.einsum("qk,fkd->fqd", _NODES, vertices[faces])
     # Flux of x through each node's part of the surface. The flux of x f gives ∫ f dV by the divergence theorem.
     flux = np.einsum("fqd,fd,q->fq", x, vectors, _WEIGHTS)
     volume = flux.sum() / 3
-    x = (x - np.einsum("fq,fqd->d", flux, x) / 4 / volume).reshape(-1, 3)
+    centroid = np.einsum("fq,fqd->d", flux, x) / 4 / volume
+    x = (x - centroid).reshape(-1, 3)
     flux = np.einsum("fqd,fd,q->fq", x.reshape(-1, 6, 3), vectors, _WEIGHTS).ravel()
     second = np.einsum("p,pi,pj->ij", flux, x, x) / 5
     along, axes = np.linalg.eigh(second)
@@ -58,23 +50,35 @@ def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
     if not even.min() > 0:
         return np.zeros((7, 6))
     # The functions h of the moments; the centroid moves with the surface, too
-    h_even = (
-        np.column_stack([np.ones(len(x)), (x @ axes) ** 2, square**2 - 4 * x @ third / volume])
-        / even
-    )
+    h_fourth = square**2 - 4 * x @ third / volume
+    h_even = np.column_stack([np.ones(len(x)), (x @ axes) ** 2, h_fourth]) / even
     h_third = x * square[:, None] - x @ (total * np.eye(3) + 2 * second) / volume
     length = max(float(np.linalg.norm(third)), 1e-9)
     scale = volume**0.5 / total**1.5
-    h_length = scale * (
-        h_third @ third / length + length * (h_even[:, 0] / 2 - 1.5 * square / total)
-    )
+    h_scale = h_even[:, 0] / 2 - 1.5 * square / total
+    h_length = scale * (h_third @ third / length + length * h_scale)
     h = np.column_stack([h_even, h_length])
     weights = np.outer(np.linalg.norm(vectors, axis=1), _WEIGHTS).ravel()
     gram = (weights[:, None] * h).T @ h
     gram[np.diag_indices(6)] *= 1 + _SECOND_ORDER**2
     scaling = np.array([3, 5, 5, 5, 7, 0]) * MAX_LOG_SCALE / max_move
-    to_moves = np.linalg.inv(np.linalg.cholesky(gram + np.outer(scaling, scaling)))
-    return np.vstack([[*np.log(even), scale * length], to_moves])
+    root = np.linalg.cholesky(gram + np.outer(scaling, scaling))
+    of_body = np.array([*np.log(even), scale * length])
+    return np.vstack([of_body, np.linalg.inv(root)])
+
+
+def _closed(vertices: Floats, faces: Integers) -> Surface:
+    """Close the holes of an open surface by cones over its centroid."""
+    start, end = directed_edges(faces)
+    n = len(vertices)
+    is_open = ~np.isin(start * n + end, end * n + start)
+    if not is_open.any():
+        return vertices, faces
+    areas = face_areas(vertices, faces)
+    centroid = np.average(vertices[faces].mean(axis=1), axis=0, weights=areas)
+    tips = np.full(is_open.sum(), n)
+    cones = np.column_stack([end[is_open], start[is_open], tips])
+    return np.vstack([vertices, centroid]), np.vstack([faces, cones])
 
 
 def distance_bounds(one: Tensor, other: Tensor) -> Tensor:
@@ -83,11 +87,12 @@ def distance_bounds(one: Tensor, other: Tensor) -> Tensor:
     def bounds(own: Tensor, others: Tensor) -> Tensor:
         """Return the bounds by the maps of the first bodies."""
         own_moments = own[:, 0]
-        maps = own[:, 1:].movedim(1, 0)
-        return sum(
-            ((row @ others[:, 0].T) - (row * own_moments).sum(1, keepdim=True)).square()
-            for row in maps
-        ).sqrt()
+        other_moments = others[:, 0]
+        squares = torch.zeros(len(own), len(others), dtype=own.dtype)
+        for row in own[:, 1:].unbind(dim=1):
+            moved = (row * own_moments).sum(1, keepdim=True)
+            squares += (row @ other_moments.T - moved).square()
+        return squares.sqrt()
 
     # The derivative of |∫ x |x|² dV| depends on the direction of the vector, which is uncertain for a short one
     return torch.minimum(bounds(one, other), bounds(other, one).T)

@@ -42,7 +42,8 @@ from igps.mesh.surface import mean_of_neighbours
 from igps.signature.attributes import AttributeName
 from igps.signature.signature import Signature
 
-_N_CACHED_SAMPLES, _N_CACHED_MESHES = 512, 64
+_N_CACHED_SAMPLES = 512
+_N_CACHED_MESHES = 64
 _NORMALS: AttributeName = "surface_direction"
 # Lengths are over √area.
 # Distance at which an alignment is given up; a tenth of it is large between copies
@@ -117,9 +118,8 @@ class Surfaces:
     def samples(self, i: int) -> SurfaceSamples:
         """Return the surface samples of a body; raise a MeshError if it is unusable, a ValueError without normals."""
         signature = self._signature(i)
-        samples = SurfaceSamples.of(
-            signature.surface.points, signature.surface.attributes[_NORMALS], signature.area
-        )
+        surface = signature.surface
+        samples = SurfaceSamples.of(surface.points, surface.attributes[_NORMALS], signature.area)
         return replace(samples, surface=lambda: self._cached_mesh(i).triangles)
 
     def coarseness(self, i: int) -> float:
@@ -161,20 +161,24 @@ class Surfaces:
         deviation = self._vertex_deviation(i, j)
         if deviation <= _SAME_SURFACE:
             return "same mesh", deviation
-        samples = map(self._cached_samples, (i, j))
         deviation = surface_distance(
-            *samples, stop_at=_SAME_SURFACE, hopeless=_HOPELESS, patch_size=1
+            self._cached_samples(i),
+            self._cached_samples(j),
+            stop_at=_SAME_SURFACE,
+            hopeless=_HOPELESS,
+            patch_size=1,
         )
-        return (
-            "same surface" if deviation <= _SAME_SURFACE else "same at another level of detail"
-        ), deviation
+        if deviation <= _SAME_SURFACE:
+            return "same surface", deviation
+        return "same at another level of detail", deviation
 
     def is_mirrored(self, i: int, j: int) -> bool:
         """Return whether one of two copies is the mirror image of the other, and not also the other itself."""
         one = self._cached_samples(i)
         other = self._cached_samples(j)
         distance = partial(surface_distance, one, other, stop_at=_SAME_SURFACE, hopeless=_HOPELESS)
-        return distance(side="same") > max(_CHIRAL * distance(side="mirrored"), _ROUNDING)
+        largest = max(_CHIRAL * distance(side="mirrored"), _ROUNDING)
+        return distance(side="same") > largest
 
     def length(self, i: int) -> tuple[float, str | None]:
         """Return √area of a body, and its unit of length if known."""
@@ -189,8 +193,9 @@ class Surfaces:
         """
         coarseness_i, handles_i = self._cached_coarseness(i)
         coarseness_j, handles_j = self._cached_coarseness(j)
-        differ = None not in (handles_i, handles_j) and handles_i != handles_j
-        if differ or _ROUNDING < self._vertex_deviation(i, j) < math.inf:
+        if None not in (handles_i, handles_j) and handles_i != handles_j:
+            return 0.0
+        if _ROUNDING < self._vertex_deviation(i, j) < math.inf:
             return 0.0
         return calibration.limit(max(coarseness_i, coarseness_j))
 
@@ -219,12 +224,14 @@ class Surfaces:
         """Return coarseness and number of handles: None for an open mesh, or if mending may have changed it."""
         body = self._cached_mesh(i)
         mesh = body.mesh
-        smoothed = TriangleSurface(mean_of_neighbours(body.vertices, mesh.faces), mesh.faces)
+        smoothed = mean_of_neighbours(body.vertices, mesh.faces)
+        surface = TriangleSurface(smoothed, mesh.faces)
+        coarseness = offset_in_place(self._cached_samples(i), surface)
         handles = None
-        if not set(repair_steps(mesh.notes)) - _HANDLE_PRESERVING:
+        if set(repair_steps(mesh.notes)) <= _HANDLE_PRESERVING:
             with contextlib.suppress(MeshError):
                 handles = mesh.genus
-        return offset_in_place(self._cached_samples(i), smoothed), handles
+        return coarseness, handles
 
     def _vertex_deviation(self, i: int, j: int) -> float:
         """Return the largest distance of vertices of the same index, or infinity if the faces of the meshes differ.

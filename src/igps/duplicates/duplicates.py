@@ -99,10 +99,12 @@ def duplicates(
     moments, failures = Surfaces(dataset).moments(limit, n_workers, progress)
     near = near_pairs(moments, _CANDIDATE_FACTOR * limit, progress)
     dataset = dataset.usable(failures)
-    if keeps_size(size, dataset.units())[0]:
+    is_size_kept, _ = keeps_size(size, dataset.units())
+    if is_size_kept:
         near = of_one_size(near, dataset)
     surfaces = Surfaces(dataset)
-    joined = _regroup(_join(near, surfaces, work), surfaces, work)
+    joined = _join(near, surfaces, work)
+    joined = _regroup(joined, surfaces, work)
     return _graded(dataset, joined, surfaces, [*failures, *surfaces.failures.values()], work)
 
 
@@ -121,13 +123,26 @@ def _graded(
     copies = []
     for (i, j), (grade, deviation), is_mirrored in zip(pairs, graded, mirrored, strict=True):
         length, unit = surfaces.length(i)
-        pair = names[i], names[j]
-        distance = joined[i, j]
-        copies.append(Copy(pair, distance, grade, deviation, deviation * length, unit, is_mirrored))
-    groups = groups_of(joined)
+        copies.append(
+            Copy(
+                names=(names[i], names[j]),
+                distance=joined[i, j],
+                grade=grade,
+                deviation=deviation,
+                largest_length=deviation * length,
+                unit=unit,
+                is_mirrored=is_mirrored,
+            )
+        )
+    groups = []
+    paths = {}
+    for members in groups_of(joined):
+        groups.append(tuple(names[i] for i in members))
+        for i in members:
+            paths[names[i]] = dataset.bodies.paths[i]
     return Duplicates(
-        groups=tuple(tuple(names[i] for i in group) for group in groups),
-        paths={names[i]: dataset.bodies.paths[i] for group in groups for i in group},
+        groups=tuple(groups),
+        paths=paths,
         copies=tuple(copies),
         n_files=len(dataset),
         failures=tuple(failures),
@@ -155,13 +170,17 @@ def of_one_size(near: NearPairs, dataset: SignatureDataset) -> NearPairs:
         signature = dataset[i].signature
         return math.log(signature.area) / 2 + math.log(millimetres(signature.unit))
 
-    return (
-        pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _SIZE_TOLERANCE
-    )
+    for i, j in near:
+        if abs(log_length(i) - log_length(j)) < _SIZE_TOLERANCE:
+            yield i, j
 
 
 def _join(near: NearPairs, surfaces: Surfaces, work: _Work) -> Pairs:
     """Return the candidate pairs that are the same, as a spanning forest: pairs within a group are skipped."""
+
+    def distance_of(pair: tuple[int, int]) -> float:
+        return surfaces.distance(*pair, work.calibration)
+
     group = DisjointSet()
     joined: Pairs = {}
     while batch := list(islice(near, _BATCH_SIZE)):
@@ -169,9 +188,7 @@ def _join(near: NearPairs, surfaces: Surfaces, work: _Work) -> Pairs:
             group.add(i)
             group.add(j)
         pairs = [pair for pair in batch if not group.connected(*pair)]
-        distances = on_threads(
-            lambda pair: surfaces.distance(*pair, work.calibration), pairs, work.n_workers
-        )
+        distances = on_threads(distance_of, pairs, work.n_workers)
         bar = Progress(distances, desc="aligned", total=len(pairs), disable=not work.progress)
         for (i, j), distance in zip(pairs, bar, strict=True):
             if distance < math.inf and group.merge(i, j):
@@ -186,11 +203,13 @@ def _regroup(joined: Pairs, surfaces: Surfaces, work: _Work) -> Pairs:
     group are assigned again, see `assigned`. No file joins two groups.
     """
     large = [members for members in groups_of(joined) if len(members) > 2]
-    reassigned = {i for members in large for i in members}
+    reassigned = set[int]().union(*large)
     final = {pair: distance for pair, distance in joined.items() if reassigned.isdisjoint(pair)}
-    regrouped = on_threads(
-        lambda members: assigned(members, surfaces, work.calibration), large, work.n_workers
-    )
+
+    def assigned_again(members: list[int]) -> Pairs:
+        return assigned(members, surfaces, work.calibration)
+
+    regrouped = on_threads(assigned_again, large, work.n_workers)
     for pairs in Progress(regrouped, desc="groups", total=len(large), disable=not work.progress):
         final |= pairs
     return final

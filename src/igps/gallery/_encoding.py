@@ -30,7 +30,8 @@ def map_to_table(short: VectorMap) -> Any:
     """Return an Arrow table of one row that holds a map to short vectors."""
     file = io.BytesIO()
     np.savez(file, **short.arrays())
-    return pa.table({"arrays": pa.array([file.getvalue()], pa.large_binary())})
+    column = pa.array([file.getvalue()], pa.large_binary())
+    return pa.table({"arrays": column})
 
 
 def map_of_table(table: Any) -> VectorMap:
@@ -76,9 +77,11 @@ def _scaled(values: Singles) -> Any:
     """Return values (N, F) over a power of two for each row, and the exponent of that power: (N, F + 1)."""
     if values.shape[1] <= _MAX_SINGLE:
         return np.pad(values, ((0, 0), (0, 1)))
-    _, exponents = np.frexp(np.abs(values).max(axis=1, keepdims=True))
+    largest = np.abs(values).max(axis=1, keepdims=True)
+    _, exponents = np.frexp(largest)
     exponents = exponents - 15  # half precision ends at 2¹⁶
-    return np.hstack([np.ldexp(values, -exponents), exponents]).astype(np.float16)
+    scaled = np.ldexp(values, -exponents)
+    return np.hstack([scaled, exponents]).astype(np.float16)
 
 
 def _with_list(table: Any, name: str, values: Any, nullable: bool = True) -> Any:
@@ -89,8 +92,10 @@ def _with_list(table: Any, name: str, values: Any, nullable: bool = True) -> Any
 def decoded(rows: Any, shape: tuple[int, ...]) -> Tensor:
     """Return the descriptions of an Arrow table."""
     flat = np.array(rows["vector"].combine_chunks().flatten())
-    values = torch.from_numpy(flat).float().reshape(len(rows), math.prod(shape) + 1)
-    return torch.ldexp(values[:, :-1], values[:, -1:]).reshape(-1, *shape)
+    n_values = math.prod(shape)
+    vectors = torch.from_numpy(flat).float().reshape(len(rows), n_values + 1)
+    scaled, exponents = vectors.split([n_values, 1], dim=1)
+    return torch.ldexp(scaled, exponents).reshape(-1, *shape)
 
 
 def with_head(schema: Any, head: Row) -> Any:

@@ -30,7 +30,8 @@ def about_of(
 def check_alike(path: str | Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
     """Raise a ValueError that names the first difference between the metadata of a gallery and those expected."""
     known = _flat(found)
-    for name, value in _flat(json.loads(json.dumps(dict(wanted)))).items():
+    as_stored = json.loads(json.dumps(dict(wanted)))
+    for name, value in _flat(as_stored).items():
         if known.get(name) != value:
             raise ValueError(
                 f"{path}: expected a gallery with {name} {_short(value)}, got {_short(known.get(name))}. Use the "
@@ -40,16 +41,13 @@ def check_alike(path: str | Path, found: Mapping[str, Any], wanted: Mapping[str,
 
 def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
     """Flatten nested dictionaries; keys are joined by a dot."""
-    inner = {
-        f"{name}.{k}": v
-        for name, value in about.items()
-        if isinstance(value, dict)
-        for k, v in value.items()
-    }
-    return {
-        **{name: value for name, value in about.items() if not isinstance(value, dict)},
-        **inner,
-    }
+    flat: dict[str, Any] = {}
+    for name, value in about.items():
+        if isinstance(value, dict):
+            flat |= {f"{name}.{key}": inner for key, inner in value.items()}
+        else:
+            flat[name] = value
+    return flat
 
 
 def _short(value: Any) -> str:

@@ -20,7 +20,6 @@ from igps.mesh.formats import dependencies_of, stat_key
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
-from igps.signature.signature import Signature
 
 _BATCH_SIZE = 256  # descriptions in memory at once
 
@@ -44,20 +43,25 @@ def described_rows(
             rows = known_rows(batch.bodies, kinds, dataset.reading)
             for i, row in enumerate(rows):
                 row["checksum"] = checksum_of(batch, i)
-            new = []
-            for i, row in enumerate(rows):
-                if not row["checksum"] or known.get(row["id"]) != row["checksum"]:
-                    new.append(i)
+            new = [i for i, row in enumerate(rows) if not _is_known(row, known)]
             failed: list[Failure] = []
             missing = batch.subset(new)
             descriptions = _described(missing, descriptor, None if strict else failed, n_workers)
             described = missing.usable(failed)
             if len(described):
                 row_of = {row["name"]: row for row in rows}
-                found = zip(described.bodies.names, described.signatures(), strict=True)
-                yield descriptions, [{**row_of[name], **_measured(own)} for name, own in found]
+                complete = []
+                for name, own in zip(described.bodies.names, described.signatures(), strict=True):
+                    measured = {"area": own.area, "volume": own.volume, "unit": own.unit}
+                    complete.append({**row_of[name], **measured})
+                yield descriptions, complete
             failures += failed
             bar.update(len(batch))
+
+
+def _is_known(row: Mapping[str, Any], known: Mapping[str, str]) -> bool:
+    checksum = row["checksum"]
+    return bool(checksum) and known.get(row["id"]) == checksum
 
 
 def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[str, type]:
@@ -66,18 +70,19 @@ def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[s
     A column is numeric if all of its values are numbers, and if the gallery does not have it as text already. A
     ValueError is raised for a name that the gallery uses itself or does not allow.
     """
-    # LanceDB has a column _rowid itself, and reads a dot as a field within a column
-    if invalid := [name for name in bodies.columns if name.startswith("_") or "." in name]:
-        expected = "expected column names without dots that do not begin with an underscore"
-        raise ValueError(f"{LABELS_FILE}: {expected}, got {invalid[0]!r}. Rename the column.")
-    if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
-        raise ValueError(
-            f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name."
-        )
-    return {
-        name: float if there.get(name) is not str and all(map(is_number, values)) else str
-        for name, values in bodies.columns.items()
-    }
+    kinds: dict[str, type] = {}
+    for name, values in bodies.columns.items():
+        # LanceDB has a column _rowid itself, and reads a dot as a field within a column
+        if name.startswith("_") or "." in name:
+            expected = "expected column names without dots that do not begin with an underscore"
+            raise ValueError(f"{LABELS_FILE}: {expected}, got {name!r}. Rename the column.")
+        if name in (*KNOWN, "vector", "code"):
+            raise ValueError(
+                f"{LABELS_FILE}: every gallery has a column {name!r}. Give the column another name."
+            )
+        is_numeric = there.get(name) is not str and all(map(is_number, values))
+        kinds[name] = float if is_numeric else str
+    return kinds
 
 
 def known_rows(
@@ -89,9 +94,15 @@ def known_rows(
     stamps = {file: _stamp(Path(file), reading) for file in set(files)}
     rows: list[dict[str, Any]] = []
     for file, part, name, label in zip(files, bodies.parts, bodies.names, labels, strict=True):
-        id_ = file if part is None else f"{file}#{part}"
         rows.append(
-            {"id": id_, "name": name, "class": label, "file": file, "part": part, **stamps[file]}
+            {
+                "id": file if part is None else f"{file}#{part}",
+                "name": name,
+                "class": label,
+                "file": file,
+                "part": part,
+                **stamps[file],
+            }
         )
     for column, values in bodies.columns.items():
         for row, value in zip(rows, values, strict=True):
@@ -111,10 +122,11 @@ def each_body_once(dataset: SignatureDataset) -> SignatureDataset:
 
 def _files(bodies: Bodies) -> list[str]:
     resolved = cache(os.path.realpath)
-    return [
-        os.path.join(resolved(os.path.dirname(path)), os.path.basename(path))
-        for path in bodies.paths
-    ]
+    files = []
+    for path in bodies.paths:
+        folder, name = os.path.split(path)
+        files.append(os.path.join(resolved(folder), name))
+    return files
 
 
 def _stamp(file: Path, reading: LoadOptions) -> dict[str, int]:
@@ -124,7 +136,8 @@ def _stamp(file: Path, reading: LoadOptions) -> dict[str, int]:
     except (OSError, MeshError):  # the description will fail with the reason
         return {"bytes": -1, "modified": -1}
     modified = max(times)
-    return {"bytes": n_bytes, "modified": modified if time.time_ns() - modified > MIN_AGE else -1}
+    is_reliable = time.time_ns() - modified > MIN_AGE
+    return {"bytes": n_bytes, "modified": modified if is_reliable else -1}
 
 
 def checksum_of(dataset: SignatureDataset, i: int) -> str:
@@ -133,10 +146,6 @@ def checksum_of(dataset: SignatureDataset, i: int) -> str:
         return dataset.key(i)
     except MeshError:  # the description will fail with the reason
         return ""
-
-
-def _measured(signature: Signature) -> dict[str, Any]:
-    return {name: getattr(signature, name) for name in ("area", "volume", "unit")}
 
 
 def _described(

@@ -40,7 +40,8 @@ def sync(
     kinds = further_columns(dataset.bodies, gallery.columns)
     # Columns that the folder no longer has
     cleared = dict.fromkeys(gallery.columns.keys() - KNOWN.keys())
-    current = [{**cleared, **row} for row in known_rows(dataset.bodies, kinds, dataset.reading)]
+    rows = known_rows(dataset.bodies, kinds, dataset.reading)
+    current = [{**cleared, **row} for row in rows]
     columns = [name for name in ("checksum", *current[0]) if name in gallery.columns]
     known = {row["id"]: row for row in gallery.rows(*columns)}
     new: list[int] = []
@@ -57,7 +58,9 @@ def sync(
     for where in _where_id(sorted(changed)):
         for batch in gallery.table.batches(where):
             descriptions, rows = gallery.table.decoded(batch)
-            gallery.table.add(descriptions, [{**row, **changed[row["id"]]} for row in rows], kinds)
+            for row in rows:
+                row |= changed[row["id"]]
+            gallery.table.add(descriptions, rows, kinds)
     failures: list[Failure] = []
     if new:
         subset = dataset.subset(new)
@@ -66,17 +69,14 @@ def sync(
             subset.usable(failures), n_workers=n_workers, strict=strict, progress=progress
         )
     prefix = f"{Path(root).resolve()}{os.sep}"
-    gone = [
-        name for name in known.keys() - {row["id"] for row in current} if name.startswith(prefix)
-    ]
     failed = {failure.id for failure in failures}
     # Their parts may exist
     unread = {row["file"] for row in current if row["part"] is None and row["name"] in failed}
-    gone = [
-        name
-        for name in gone
-        if known[name]["file"] not in unread and not _is_hidden(known[name]["file"])
-    ]
+    gone = []
+    for name in known.keys() - {row["id"] for row in current}:
+        file = known[name]["file"]
+        if name.startswith(prefix) and file not in unread and not _is_hidden(file):
+            gone.append(name)
     for where in _where_id(gone):
         gallery.remove(where)
     return len(new) - len(failures), len(gone), failures

@@ -29,7 +29,8 @@ class FolderResolver(trimesh.resolvers.Resolver):
     def path(self, name: str) -> Path:
         """Return the path of a file; characters of the name may be escaped as in URLs."""
         path = (self._folder / name).resolve()
-        path = path if path.is_file() else (self._folder / unquote(name)).resolve()
+        if not path.is_file():
+            path = (self._folder / unquote(name)).resolve()
         if not path.is_relative_to(self._folder):
             raise ValueError(f"it refers to {name!r}, outside of its folder")
         return path
@@ -57,15 +58,14 @@ def objects(
     """
     loading = {"file_type": path.suffix.lower().lstrip("."), **loading}
     stream = BytesIO(path.read_bytes() if content is None else content)
-    scene = trimesh.load_scene(
-        stream, resolver=FolderResolver(path.parent), process=False, **loading
-    )
+    folder = FolderResolver(path.parent)
+    scene = trimesh.load_scene(stream, resolver=folder, process=False, **loading)
     nodes = [(node, *scene.graph.get(node)) for node in scene.graph.nodes_geometry]
-    sizes = {
-        name: 24 * (len(x.vertices) + len(getattr(x, "faces", ())))
-        for name, x in scene.geometry.items()
-    }
-    check_unpacked(sum(sizes[name] for _, _, name in nodes), path, options.max_unpacked)
+    n_rows = 0  # of vertices and faces; a geometry may be in many places
+    for _, _, name in nodes:
+        geometry = scene.geometry[name]
+        n_rows += len(geometry.vertices) + len(getattr(geometry, "faces", ()))
+    check_unpacked(24 * n_rows, path, options.max_unpacked)
     surfaces: dict[str, list[RawBody]] = {}
     for node, matrix, name in nodes:
         surface = _surface(scene.geometry[name], matrix)

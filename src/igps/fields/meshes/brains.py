@@ -22,7 +22,8 @@ _TYPES = {
     "NIFTI_TYPE_INT32": "i4",
     "NIFTI_TYPE_UINT8": "u1",
 }
-_POINTS, _TRIANGLES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
+_POINTS = "NIFTI_INTENT_POINTSET"
+_TRIANGLES = "NIFTI_INTENT_TRIANGLE"
 _MAX_AXES = 6
 _MAGIC = b"\xff\xff\xfe"
 # Behind the triangles if the points are in the coordinates of images
@@ -37,36 +38,37 @@ _SUFFIXES = tuple(side + kind for side in _SIDES for kind in _KINDS)
 
 
 def read_gifti(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    root = _xml.parse(path.read_bytes())
-    arrays = {
-        intent: _array(element, path, options)
-        for element in reversed(list(root.iter("DataArray")))  # the first of several wins
-        if (intent := element.get("Intent")) in (_POINTS, _TRIANGLES)
-    }
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for element in _xml.parse(path.read_bytes()).iter("DataArray"):
+        intent = element.get("Intent", "")
+        if intent in (_POINTS, _TRIANGLES) and intent not in arrays:  # the first of several wins
+            arrays[intent] = _array(element, path, options)
     if len(arrays) < 2:
         raise ValueError(
             "no surface in it: expected points and triangles, which maps of values on a surface lack"
         )
     vertices = arrays[_POINTS].astype(np.float64)
-    return [RawBody(vertices, arrays[_TRIANGLES].astype(np.int64), unit="mm", frame="RAS")]
+    faces = arrays[_TRIANGLES].astype(np.int64)
+    return [RawBody(vertices, faces, unit="mm", frame="RAS")]
 
 
 def gifti_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.generic]]:
     """Return the arrays of values at vertices of a GIFTI file by name."""
     arrays = {}
     for number, element in enumerate(_xml.parse(path.read_bytes()).iter("DataArray"), 1):
-        if element.get("Intent") not in (_POINTS, _TRIANGLES):
-            names = [
-                entry.findtext("Value")
-                for entry in element.iter("MD")
-                if entry.findtext("Name") == "Name"
-            ]
-            arrays[(names or [None])[0] or f"array {number}"] = _array(element, path, options)
+        if element.get("Intent") in (_POINTS, _TRIANGLES):
+            continue
+        title = None
+        for entry in element.iter("MD"):
+            if title is None and entry.findtext("Name") == "Name":
+                title = entry.findtext("Value")
+        arrays[title or f"array {number}"] = _array(element, path, options)
     return arrays
 
 
 def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.generic]:
-    if (n_axes := int(element.get("Dimensionality", "2"))) > _MAX_AXES:
+    n_axes = int(element.get("Dimensionality", "2"))
+    if n_axes > _MAX_AXES:
         raise ValueError(f"an array of {n_axes} axes, expected at most {_MAX_AXES}")
     shape = [int(element.get(f"Dim{i}", "0")) for i in range(n_axes)]
     kind = np.dtype(_TYPES[element.get("DataType", "")])
@@ -78,7 +80,8 @@ def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.gen
         values = _xml.from_text(text, kind)
     elif encoding in ("Base64Binary", "GZipBase64Binary"):
         content = base64.b64decode("".join(text.split()), validate=True)
-        content = _xml.inflated(content, n_bytes) if encoding.startswith("GZip") else content
+        if encoding == "GZipBase64Binary":
+            content = _xml.inflated(content, n_bytes)
         order = _xml.byte_order(element.get("Endian", ""))
         values = np.frombuffer(content, kind.newbyteorder(order))
     else:
@@ -86,8 +89,9 @@ def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.gen
     indexing = element.get("ArrayIndexingOrder", "RowMajorOrder")
     if indexing not in ("RowMajorOrder", "ColumnMajorOrder"):
         raise ValueError(f"expected RowMajorOrder or ColumnMajorOrder, got {indexing[:40]!r}")
-    is_column_major = indexing == "ColumnMajorOrder"
-    return values.reshape(shape[::-1]).T if is_column_major else values.reshape(shape)
+    if indexing == "ColumnMajorOrder":
+        return values.reshape(shape[::-1]).T
+    return values.reshape(shape)
 
 
 def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -95,15 +99,17 @@ def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[
     at = content.find(b"\n\n") + 2  # behind a line about the author
     if not content.startswith(_MAGIC) or at < 2:
         raise ValueError("not a triangle file of FreeSurfer")
-    n_vertices, n_faces = (int(n) for n in np.frombuffer(content, ">i4", 2, at))
+    n_vertices, n_faces = np.frombuffer(content, ">i4", 2, at).tolist()
+    start = at + 8
+    middle = start + 12 * n_vertices
     n_expected = 12 * (n_vertices + n_faces)
-    n_bytes = len(content) - at - 8
+    n_bytes = len(content) - start
     if min(n_vertices, n_faces) < 0 or n_bytes < n_expected:
         raise ValueError(
             f"expected {n_vertices} vertices, {n_faces} triangles, {n_expected} bytes, got {n_bytes}"
         )
-    vertices = np.frombuffer(content, ">f4", 3 * n_vertices, at + 8).astype(np.float64)
-    faces = np.frombuffer(content, ">i4", 3 * n_faces, at + 8 + 12 * n_vertices).astype(np.int64)
+    vertices = np.frombuffer(content, ">f4", 3 * n_vertices, start).astype(np.float64)
+    faces = np.frombuffer(content, ">i4", 3 * n_faces, middle).astype(np.int64)
     return [RawBody(vertices.reshape(-1, 3), faces.reshape(-1, 3), unit="mm", frame="RAS")]
 
 
@@ -117,11 +123,15 @@ def in_scanner(path: Path, points: Floats) -> Floats:
         return points
     content = path.read_bytes()
     at = content.find(b"\n\n") + 2
-    tail = content[at + 8 + 12 * int(np.frombuffer(content, ">i4", 2, at).sum()) :]
-    axes = np.array(_VOLUME_AXES.findall(tail), dtype=np.float64)  # and the centre, (4, 3)
-    if axes.shape != (4, 3) or not re.search(rb"valid\s*=\s*1", tail) or tail[:8] == _SCANNER_TAG:
+    n_rows = int(np.frombuffer(content, ">i4", 2, at).sum())  # of vertices and triangles
+    tail = content[at + 8 + 12 * n_rows :]
+    geometry = np.array(_VOLUME_AXES.findall(tail), dtype=np.float64)
+    is_valid = re.search(rb"valid\s*=\s*1", tail) is not None
+    if geometry.shape != (4, 3) or not is_valid or tail[:8] == _SCANNER_TAG:
         return points
-    return points @ _SURFACE_AXES.T @ axes[:3] + axes[3]
+    axes = geometry[:3]
+    centre = geometry[3]
+    return points @ _SURFACE_AXES.T @ axes + centre
 
 
 def is_freesurfer(path: Path) -> bool:

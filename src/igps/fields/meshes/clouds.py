@@ -11,9 +11,12 @@ from igps.mesh.raw_body import RawBody
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     rows = np.loadtxt(path, ndmin=2, comments=("#", "//"), encoding="latin-1")  # decodes any byte
-    if rows.shape[1] not in (3, 6):
-        raise ValueError(f"expected 3 numbers in a line, or 6 with normals, got {rows.shape[1]}")
-    return [RawBody(rows[:, :3], normals=rows[:, 3:] if rows.shape[1] == 6 else None)]
+    n_columns = rows.shape[1]
+    if n_columns == 3:
+        return [RawBody(rows)]
+    if n_columns == 6:
+        return [RawBody(rows[:, :3], normals=rows[:, 3:])]
+    raise ValueError(f"expected 3 numbers in a line, or 6 with normals, got {n_columns}")
 
 
 FORMAT = Format("points", (".xyz",), read)

@@ -1,5 +1,6 @@
 """Wavefront OBJ: vertices and polygons as text, in objects or groups; textures, normals and curves are ignored."""
 
+import itertools
 import re
 from pathlib import Path
 
@@ -20,12 +21,10 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     polygons: list[str] = []
     n_before: list[int] = []  # vertices above each polygon: negative indices count back from there
     # Of objects and groups: first polygon, and name
-    starts: dict[str, list[tuple[int, str]]] = {
-        "o": [],
-        "g": [],
-    }
+    starts: dict[str, list[tuple[int, str]]] = {"o": [], "g": []}
     has_lines = False
-    for line in text_of(path).replace("\\\n\n", " ").replace("\\\n", " ").split("\n"):
+    continued = text_of(path).replace("\\\n\n", " ").replace("\\\n", " ")
+    for line in continued.split("\n"):
         word, _, fields = line.lstrip().replace("\t", " ").partition(" ")
         if word == "v":
             coordinates.append(fields)
@@ -45,15 +44,14 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
             raise ValueError(ONLY_LINES)
         return [RawBody(vertices)]
     corners, n_corners = _corners(polygons, np.array(n_before, dtype=np.int64))
-    names, owner = (
-        _owners(starts, len(polygons)) if options.bodies == "objects" else ([], np.zeros(0))
-    )
-    if len(names) < 2:
+    names, owner = _owners(starts, len(polygons))
+    if options.bodies != "objects" or len(names) < 2:
         return [RawBody(vertices, flat_triangles(corners, n_corners, vertices))]
     bodies = []
     for number, name in enumerate(names):
         is_own = owner == number
-        faces = flat_triangles(corners[np.repeat(is_own, n_corners)], n_corners[is_own], vertices)
+        own_corners = corners[np.repeat(is_own, n_corners)]
+        faces = flat_triangles(own_corners, n_corners[is_own], vertices)
         used, index = np.unique(faces, return_inverse=True)
         if len(used) and (used[0] < 0 or used[-1] >= len(vertices)):
             raise ValueError(f"object {name!r} refers to vertices that are not there")
@@ -71,25 +69,25 @@ def _corners(polygons: list[str], n_before: Integers) -> tuple[Integers, Integer
     corners = np.array([int(word) for row in rows for word in row], dtype=np.int64)
     if (corners == 0).any():
         raise ValueError("a face refers to vertex 0; vertices are counted from 1")
-    return np.where(corners > 0, corners - 1, corners + np.repeat(n_before, n_corners)), n_corners
+    from_end = np.repeat(n_before, n_corners) + corners
+    return np.where(corners > 0, corners - 1, from_end), n_corners
 
 
 def _owners(
     starts: dict[str, list[tuple[int, str]]], n_polygons: int
 ) -> tuple[list[str], Integers]:
     """Return the names of objects (or groups) with polygons, and for each polygon the index of its object, (P,)."""
-    parts = [(0, "unnamed"), *(starts["o"] or starts["g"])]
-    ends = [*(first for first, _ in parts[1:]), n_polygons]
-    ranges = [
-        (name or "unnamed", end - first)
-        for (first, name), end in zip(parts, ends, strict=True)
-        if end > first
-    ]
-    names = [name for name, _ in ranges]
-    # Objects of the same name are separate, but a group may continue further down
-    names = distinct(names) if starts["o"] else names
+    parts = [(0, ""), *(starts["o"] or starts["g"]), (n_polygons, "")]
+    names = []
+    lengths = []
+    for (first, name), (end, _) in itertools.pairwise(parts):
+        if end > first:
+            names.append(name or "unnamed")
+            lengths.append(end - first)
+    if starts["o"]:  # objects of the same name are separate, but a group may continue further down
+        names = distinct(names)
     index = {name: i for i, name in enumerate(dict.fromkeys(names))}
-    return list(index), np.repeat([index[name] for name in names], [length for _, length in ranges])
+    return list(index), np.repeat([index[name] for name in names], lengths)
 
 
 FORMAT = Format("OBJ", (".obj",), read, bodies=("whole", "objects"))

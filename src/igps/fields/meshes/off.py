@@ -35,16 +35,16 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
         raise ValueError("expected three coordinates for each vertex, got four (4OFF)")
     n_vertices, n_faces, *_ = map(int, lines[0].split())
     coordinates = lines[1 : n_vertices + 1]
-    rows = lines[n_vertices + 1 :][:n_faces]
+    behind = lines[n_vertices + 1 :]
+    rows = behind[:n_faces]
     if min(n_vertices, n_faces) < 0 or len(rows) < n_faces or len(coordinates) < n_vertices:
         raise ValueError(
             f"expected {n_vertices} vertices and {n_faces} faces, got {len(lines) - 1} lines"
         )
     if not coordinates:
         return [RawBody()]
-    vertices = np.array([line.split()[:3] for line in coordinates], dtype=np.float64).reshape(
-        n_vertices, 3
-    )
+    columns = [line.split()[:3] for line in coordinates]
+    vertices = np.array(columns, dtype=np.float64).reshape(n_vertices, 3)
     corners, n_corners = _corners(rows)
     if corners.min(initial=0) < 0 or corners.max(initial=0) >= n_vertices:
         raise ValueError("a face refers to a vertex that is not there")
@@ -58,12 +58,17 @@ def _corners(lines: list[str]) -> tuple[Integers, Integers]:
         with suppress(ValueError):  # many times faster, if all polygons have as many corners
             rows = np.loadtxt(lines, np.int64, comments=None, ndmin=2)
             n_corners = rows[:, 0]
-            if (n_corners == n_corners[0]).all() and n_corners[0] < rows.shape[1]:
-                return rows[:, 1 : n_corners[0] + 1].ravel(), n_corners
-    words = [line.split() for line in lines]
-    n_corners = np.array([int(row[0]) for row in words], dtype=np.int64)
-    polygons = [row[1 : n + 1] for n, row in zip(n_corners.tolist(), words, strict=True)]
-    corners = np.array([int(corner) for polygon in polygons for corner in polygon], dtype=np.int64)
+            n = n_corners[0]
+            if (n_corners == n).all() and n < rows.shape[1]:
+                return rows[:, 1 : n + 1].ravel(), n_corners
+    counts = []
+    words: list[str] = []
+    for line in lines:
+        count, *further = line.split()
+        counts.append(int(count))
+        words += further[: int(count)]
+    n_corners = np.array(counts, dtype=np.int64)
+    corners = np.array([int(word) for word in words], dtype=np.int64)
     if len(corners) != n_corners.sum():
         raise ValueError("a line with fewer corners than it declares")
     return corners, n_corners

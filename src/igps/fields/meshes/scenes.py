@@ -95,8 +95,12 @@ def _scene(path: Path) -> dict[str, Any]:
     """Parse the JSON of a glTF file: all of a .gltf, or the first chunk of a .glb."""
     with path.open("rb") as file:
         head = file.read(20)
-        is_binary = head.startswith(b"glTF")
-        text = file.read(int.from_bytes(head[12:16], "little")) if is_binary else head + file.read()
+
+        if head.startswith(b"glTF"):
+            n_bytes = int.from_bytes(head[12:16], "little")
+            text = file.read(n_bytes)
+        else:
+            text = head + file.read()
     return dict(json.loads(text))
 
 

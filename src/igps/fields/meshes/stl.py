@@ -51,19 +51,21 @@ def _read_binary(content: bytes, n_declared: int) -> tuple[Floats, tuple[str, ..
     """Read the triangles of the file, even if their number differs from that in the header."""
     n_complete = max(len(content) - _HEADER, 0) // _TRIANGLE.itemsize
     n = min(n_complete, n_declared) or n_complete
-    notes = (
-        () if n == n_declared else (f"the header declares {n_declared} triangles: {n} were read",)
-    )
+    notes: tuple[str, ...] = ()
+    if n != n_declared:
+        notes = (f"the header declares {n_declared} triangles: {n} were read",)
     rows = np.frombuffer(content, _TRIANGLE, n, _HEADER) if n else np.zeros(0, _TRIANGLE)
-    return rows["corners"].reshape(-1, 3).astype(np.float64), notes
+    corners = rows["corners"].reshape(-1, 3)
+    return corners.astype(np.float64), notes
 
 
 def merged(corners: Floats) -> Surface:
     """Merge equal corners (3F, 3) into vertices (V, 3), in order of their first use; return them and faces (F, 3)."""
     corners = corners + 0.0  # turns -0 into 0
     _, first, index = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    vertices = corners[np.sort(first)]
     rank = np.argsort(np.argsort(first))
-    return corners[np.sort(first)], rank[index.ravel()].reshape(-1, 3)
+    return vertices, rank[index.ravel()].reshape(-1, 3)
 
 
 FORMAT = Format("STL", (".stl", ".stl_ascii"), read)

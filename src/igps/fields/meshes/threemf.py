@@ -125,20 +125,19 @@ class _Model:
         for self._member in members:
             with archive.open(self._member) as stream:
                 _xml.walk(stream, self._start)
-            referred = {placed.key[0] for obj in self.objects.values() for placed in obj.components}
-            members.extend(
-                sorted((referred | {placed.key[0] for placed in self.items}) - set(members))
-            )
+            placed = list(self.items)
+            for obj in self.objects.values():
+                placed += obj.components
+            referred = {one.key[0] for one in placed}
+            members.extend(sorted(referred - set(members)))
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         if name == "vertex":
-            self._object.vertices.extend(
-                (float(attributes["x"]), float(attributes["y"]), float(attributes["z"]))
-            )
+            place = (float(attributes["x"]), float(attributes["y"]), float(attributes["z"]))
+            self._object.vertices.extend(place)
         elif name == "triangle":
-            self._object.triangles.extend(
-                (int(attributes["v1"]), int(attributes["v2"]), int(attributes["v3"]))
-            )
+            corners = (int(attributes["v1"]), int(attributes["v2"]), int(attributes["v3"]))
+            self._object.triangles.extend(corners)
         elif name == "object":
             number = attributes["id"]
             label = attributes.get("name") or attributes.get("partnumber") or f"object {number}"
@@ -155,13 +154,13 @@ class _Model:
 
     def _placed(self, attributes: dict[str, str]) -> _Placed:
         numbers = attributes.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
-        path = next(
-            (value for key, value in attributes.items() if key.rpartition(":")[2] == "path"), ""
-        ).lstrip("/")
         matrix = np.array(numbers, dtype=np.float64).reshape(4, 3)
-        return _Placed(
-            (path or self._member, attributes["objectid"]), matrix, attributes.get("partnumber", "")
-        )
+        member = self._member
+        for key, value in attributes.items():
+            if key.rpartition(":")[2] == "path":  # in a namespace
+                member = value.lstrip("/") or self._member
+        key_of_object = (member, attributes["objectid"])
+        return _Placed(key_of_object, matrix, attributes.get("partnumber", ""))
 
     def parts(
         self, placed: _Placed, budget: list[int], depth: int = 0, role: str = ""
@@ -179,8 +178,9 @@ class _Model:
             corners = np.frombuffer(obj.vertices).reshape(-1, 3)
             vertices = corners @ placed.matrix[:3] + placed.matrix[3]
             faces = np.frombuffer(obj.triangles, dtype=np.int64).reshape(-1, 3)
-            is_mirrored = np.linalg.det(placed.matrix[:3]) < 0
-            faces = np.ascontiguousarray(faces[:, ::-1]) if is_mirrored else faces.copy()
+            if np.linalg.det(placed.matrix[:3]) < 0:  # it mirrors
+                faces = faces[:, ::-1]
+            faces = faces.copy(order="C")
             ranges = self._roles.of_triangles.get(number) or [(0, len(faces) - 1, role)]
             for first, last, own_role in ranges:
                 yield _Part(vertices, faces[first : last + 1], role or own_role)
@@ -232,29 +232,35 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     with zipfile.ZipFile(path) as archive:
         models = [info for info in archive.infolist() if info.filename.lower().endswith(".model")]
         check_unpacked(sum(info.file_size for info in models), path, options.max_unpacked)
-        names = [info.filename for info in models]
-        if not names:
+        members = {info.filename.lower(): info.filename for info in reversed(models)}
+        if not models:
             raise ValueError("no model in it")
-        main = next((name for name in names if name.lower() == "3d/3dmodel.model"), names[0])
+        main = members.get("3d/3dmodel.model", models[0].filename)
         model = _Model(archive, main)
     if model.n_not_printed and not model.items:
         raise ValueError("none of its items is to be printed")
-    items = model.items or [
-        _Placed(key, np.eye(4, 3)) for key, obj in model.objects.items() if obj.triangles
-    ]
+    items = model.items
+    if not items:
+        with_surface = [key for key, obj in model.objects.items() if obj.triangles]
+        items = [_Placed(key, np.eye(4, 3)) for key in with_surface]
     budget = [options.max_unpacked]
     parts = [list(model.parts(item, budget)) for item in items]
     check_unpacked(options.max_unpacked - budget[0], path, options.max_unpacked)
     names = distinct(item.name or model.objects[item.key].name for item in items)
     unit = _UNITS.get(model.unit or "millimeter")
     source: UnitSource = "header" if model.unit else "format"
-    bodies = [_material(own, name) for name, own in zip(names, parts, strict=True) if own]
-    material = [replace(body, unit=unit, unit_from=source) for body in bodies if body is not None]
-    if bodies and not material:
+    material = []
+    n_left_out = 0
+    for name, own in zip(names, parts, strict=True):
+        body = _material(own, name)
+        if body is not None:
+            material.append(replace(body, unit=unit, unit_from=source))
+        elif own:
+            n_left_out += 1
+    if n_left_out and not material:
         raise ValueError(
             "nothing in it is material: all objects are supports, modifiers or negative"
         )
-    n_left_out = len(bodies) - len(material)
     notes = []
     if n_left_out:
         objects = counted(n_left_out, "object")

@@ -13,6 +13,7 @@ from igps.fields.meshes import vertex_values
 from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef, load_mesh, read_surface
 from igps.mesh.options import LoadOptions
+from igps.mesh.raw_body import RawBody
 from igps.signature.mean_value import extend
 
 
@@ -48,15 +49,18 @@ class VertexAttribute(FileAttribute):
         columns = fill_missing(values.reshape(len(values), -1), raw.vertices, str(file))
         mesh = load_mesh(body.path, self.reading, part=body.part)
         if not np.array_equal(mesh.vertices, raw.vertices):
-            faces = np.ascontiguousarray(raw.faces)
-            _, face, nearest = igl.point_mesh_squared_distance(
-                mesh.vertices, np.ascontiguousarray(raw.vertices), faces
-            )
-            corners = [np.ascontiguousarray(raw.vertices[faces[face, i]]) for i in range(3)]
-            weights = np.nan_to_num(
-                igl.barycentric_coordinates(np.ascontiguousarray(nearest), *corners), nan=1 / 3
-            )
-            columns = np.einsum("vi,vid->vd", weights, columns[faces[face]])
-        return extend(mesh.vertices, mesh.faces, columns, points).reshape(
-            len(points), *values.shape[1:]
-        )
+            columns = _at_nearest(mesh.vertices, raw, columns)
+        extended = extend(mesh.vertices, mesh.faces, columns, points)
+        return extended.reshape(len(points), *values.shape[1:])
+
+
+def _at_nearest(points: Floats, raw: RawBody, columns: Floats) -> Floats:
+    """Return values (P, C) where a surface is nearest to points (P, 3), from those (V, C) at its vertices."""
+    vertices = np.ascontiguousarray(raw.vertices)
+    faces = np.ascontiguousarray(raw.faces)
+    _, face, nearest = igl.point_mesh_squared_distance(points, vertices, faces)
+    ends = faces[face]
+    corners = [np.ascontiguousarray(vertices[ends[:, i]]) for i in range(3)]
+    weights = igl.barycentric_coordinates(np.ascontiguousarray(nearest), *corners)
+    weights = np.nan_to_num(weights, nan=1 / 3)
+    return np.einsum("vi,vid->vd", weights, columns[ends])

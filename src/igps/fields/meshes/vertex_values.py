@@ -49,11 +49,12 @@ def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
 def _ply(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read the properties of vertices other than coordinates, normals and colours."""
     ignored = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
-    return {
-        name: column.numbers
-        for name, column in ply.elements(path)["vertex"].items()
-        if name not in ignored and (column.lengths == 1).all()
-    }
+    values = {}
+    for name, column in ply.elements(path)["vertex"].items():
+        is_single = (column.lengths == 1).all()
+        if name not in ignored and is_single:
+            values[name] = column.numbers
+    return values
 
 
 def _freesurfer(path: Path) -> NDArray[np.generic]:
@@ -62,7 +63,7 @@ def _freesurfer(path: Path) -> NDArray[np.generic]:
         raise ValueError(
             "expected PLY, VTK or GIFTI by its suffix, or a file of values of FreeSurfer"
         )
-    n, _, n_values = (int(x) for x in np.frombuffer(content, ">i4", 3, 3))
+    n, _, n_values = np.frombuffer(content, ">i4", 3, 3).tolist()
     if n < 1 or n_values != 1 or len(content) < 15 + 4 * n:
         raise ValueError(
             f"expected {n} values in {4 * n} bytes, got {n_values} a vertex in {len(content) - 15} bytes"

@@ -93,7 +93,8 @@ class _Legacy:
     def numbers(self, n: int, type_name: str) -> NDArray[np.generic]:
         kind = np.dtype(_LEGACY_TYPES[type_name.lower()])
         n_left = len(self._content) - self._at
-        if not 0 <= n <= n_left // (2 if self._is_text else kind.itemsize) + 1:
+        least_bytes = 2 if self._is_text else kind.itemsize  # of a number
+        if not 0 <= n <= n_left // least_bytes + 1:
             raise ValueError(f"expected {n} numbers, got {n_left} bytes")
         if not self._is_text:
             values = np.frombuffer(self._content, kind.newbyteorder(">"), n, self._at)
@@ -120,38 +121,34 @@ class _Legacy:
             raise ValueError("the numbers of corners do not add up")
         return corners, n_corners
 
-    def skip_field(self, n_arrays: int) -> None:
-        for _ in range(n_arrays):
-            _, width, length, kind = self.line().split()
-            self.numbers(int(width) * int(length), kind)
-
     def geometry(self) -> tuple[Floats, list[Cells], str]:
         """Read points and cells; return also the first line behind them."""
         vertices = np.zeros((0, 3))
         cells: list[Cells] = []
-        while (words := self.line().split()) and words[0].upper() not in (
-            "POINT_DATA",
-            "CELL_DATA",
-        ):
-            word = words[0].upper()
-            if word == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
-                raise ValueError(f"expected POLYDATA or UNSTRUCTURED_GRID, got {words[1]}")
-            if word == "POINTS":
-                vertices = (
-                    self.numbers(3 * int(words[1]), words[2]).astype(np.float64).reshape(-1, 3)
-                )
+        while True:
+            words = self.line().split()
+            word = words[0].upper() if words else ""
+            if word in ("", "POINT_DATA", "CELL_DATA"):
+                return vertices, cells, " ".join(words).upper()
+            if word == "DATASET":
+                if words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
+                    raise ValueError(f"expected POLYDATA or UNSTRUCTURED_GRID, got {words[1]}")
+            elif word == "POINTS":
+                coordinates = self.numbers(3 * int(words[1]), words[2])
+                vertices = coordinates.astype(np.float64).reshape(-1, 3)
             elif word in ("POLYGONS", "TRIANGLE_STRIPS", "CELLS", "VERTICES", "LINES"):
                 corners, n_corners = self.cells(int(words[1]), int(words[2]))
-                cells.append(
-                    (corners, n_corners, np.full(len(n_corners), _LEGACY_CELLS.get(word, 0)))
-                )
+                kinds = np.full(len(n_corners), _LEGACY_CELLS.get(word, 0))
+                cells.append((corners, n_corners, kinds))
             elif word == "CELL_TYPES" and cells:
-                cells[-1] = (*cells[-1][:2], self.numbers(int(words[1]), "int").astype(np.int64))
+                corners, n_corners, _ = cells[-1]
+                kinds = self.numbers(int(words[1]), "int").astype(np.int64)
+                cells[-1] = (corners, n_corners, kinds)
             elif word == "FIELD":
-                self.skip_field(int(words[2]))
-            elif word != "DATASET":  # skipped cells would leave a cloud of points
+                for _ in range(int(words[2])):
+                    self._field_array()
+            else:  # skipped cells would leave a cloud of points
                 raise ValueError(f"expected a section of points or cells, got {word[:40]!r}")
-        return vertices, cells, " ".join(words).upper()
 
     def arrays(self, heading: str, n_points: int) -> dict[str, NDArray[np.generic]]:
         """Read the arrays at points by name; `heading` is the line before."""
@@ -164,32 +161,37 @@ class _Legacy:
                 is_of_points = word == "POINT_DATA"
                 n = int(words[1])
                 continue
-            n_arrays = (
-                int(words[2]) if word == "FIELD" else word in ("VECTORS", "NORMALS", "SCALARS")
-            )
-            for _ in range(n_arrays):
-                if word == "FIELD":
-                    name, width, length, kind = self.line().split()
-                else:
-                    name = words[1]
-                    width = "3"
-                    length = str(n)
-                    kind = words[2]
-                if word == "SCALARS":
-                    width = words[3] if len(words) > 3 else "1"
-                    before = self._at
-                    if not self.line().upper().startswith("LOOKUP_TABLE"):
-                        self._at = before
-                values = self.numbers(int(width) * int(length), kind).reshape(
-                    int(length), int(width)
-                )
-                if is_of_points and int(length) == n_points:
+            if word == "FIELD":
+                found = [self._field_array() for _ in range(int(words[2]))]
+            elif word in ("VECTORS", "NORMALS"):
+                found = [(words[1], self._rows(n, 3, words[2]))]
+            elif word == "SCALARS":
+                width = int(words[3]) if len(words) > 3 else 1
+                self._skip_lookup_table()
+                found = [(words[1], self._rows(n, width, words[2]))]
+            else:
+                continue
+            for name, values in found:
+                if is_of_points and len(values) == n_points:
                     arrays[name] = _squeezed(values)
         return arrays
 
+    def _field_array(self) -> tuple[str, NDArray[np.generic]]:
+        name, width, length, kind = self.line().split()
+        return name, self._rows(int(length), int(width), kind)
+
+    def _rows(self, length: int, width: int, kind: str) -> NDArray[np.generic]:
+        return self.numbers(width * length, kind).reshape(length, width)
+
+    def _skip_lookup_table(self) -> None:
+        before = self._at
+        if not self.line().upper().startswith("LOOKUP_TABLE"):
+            self._at = before
+
 
 def read_legacy(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    return [_body(*_Legacy(path.read_bytes()).geometry()[:2])]
+    vertices, cells, _ = _Legacy(path.read_bytes()).geometry()
+    return [_body(vertices, cells)]
 
 
 def point_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.generic]]:
@@ -218,11 +220,12 @@ def read_xml(path: Path, options: LoadOptions, part: str | None) -> list[RawBody
     """Read the surfaces of an XML file of polygons or cells; each piece is a body."""
     file = _Xml(path, options)
     pieces = list(file.root.iter("Piece"))
-    if len(pieces) == 1:
-        return [_body(*file.geometry(pieces[0]))]
-    return [
-        _body(*file.geometry(piece), f"piece {number}") for number, piece in enumerate(pieces, 1)
-    ]
+    bodies = []
+    for number, piece in enumerate(pieces, 1):
+        vertices, cells = file.geometry(piece)
+        name = f"piece {number}" if len(pieces) > 1 else None
+        bodies.append(_body(vertices, cells, name))
+    return bodies
 
 
 class _Xml:
@@ -242,9 +245,8 @@ class _Xml:
             content = content[:start] + b"</VTKFile>"
         self.root = _xml.parse(content)
         self._order = _xml.byte_order(self.root.get("byte_order", "LittleEndian"))
-        self._header = np.dtype(
-            f"{self._order}u{8 if self.root.get('header_type') == 'UInt64' else 4}"
-        )
+        n_bytes = 8 if self.root.get("header_type") == "UInt64" else 4
+        self._header = np.dtype(f"{self._order}u{n_bytes}")
         name = self.root.get("compressor")
         if name is not None and name not in _COMPRESSORS:
             raise ValueError(
@@ -260,23 +262,20 @@ class _Xml:
         _check_declared(piece, "Points", len(vertices))
         cells: list[Cells] = []
         for group in (*_XML_CELLS, "Cells"):
-            arrays = {
-                element.get("Name"): self.array(element)
-                for element in piece.findall(f"{group}/DataArray")
-            }
+            arrays = {}
+            for element in piece.findall(f"{group}/DataArray"):
+                arrays[element.get("Name")] = self.array(element)
             _check_declared(piece, group, len(arrays.get("offsets", ())))
-            if len(arrays) >= 2:
-                n_corners = np.asarray(
-                    np.diff(arrays["offsets"].astype(np.int64), prepend=0), dtype=np.int64
-                )
-                kinds = (
-                    arrays["types"]
-                    if group == "Cells"
-                    else np.full(len(n_corners), _XML_CELLS[group])
-                )
-                cells.append(
-                    (arrays["connectivity"].astype(np.int64), n_corners, kinds.astype(np.int64))
-                )
+            if len(arrays) < 2:
+                continue
+            corners = arrays["connectivity"].astype(np.int64)
+            ends = arrays["offsets"].astype(np.int64)
+            n_corners = np.diff(ends, prepend=np.int64(0))
+            if group == "Cells":
+                kinds = arrays["types"].astype(np.int64)
+            else:
+                kinds = np.full(len(n_corners), _XML_CELLS[group], dtype=np.int64)
+            cells.append((corners, n_corners, kinds))
         return vertices, cells
 
     def array(self, element: Element) -> NDArray[np.generic]:
@@ -286,11 +285,11 @@ class _Xml:
         if encoding == "ascii":
             values = _xml.from_text(text, kind)
         elif encoding == "appended":
-            values = np.frombuffer(
-                self._decode(self._appended[int(element.get("offset", "0")) :], self._is_raw), kind
-            )
+            start = int(element.get("offset", "0"))
+            values = np.frombuffer(self._decode(self._appended[start:], self._is_raw), kind)
         else:
-            values = np.frombuffer(self._decode("".join(text.split()).encode(), False), kind)
+            content = "".join(text.split()).encode()
+            values = np.frombuffer(self._decode(content, is_raw=False), kind)
         # A sum, as thousands of arrays may refer to the same bytes
         self._n_unpacked += values.nbytes
         check_unpacked(self._n_unpacked, self._path, self._options.max_unpacked)
@@ -305,9 +304,8 @@ class _Xml:
         header = _first((3 + n) * size, content, is_raw)
         _, n_bytes, n_last, *packed_sizes = np.frombuffer(header, self._header).tolist()
         check_unpacked(n * n_bytes, self._path, self._options.max_unpacked)
-        packed = _first(
-            sum(packed_sizes), content[len(header) if is_raw else _n_letters(len(header)) :], is_raw
-        )
+        start = len(header) if is_raw else _n_letters(len(header))
+        packed = _first(sum(packed_sizes), content[start:], is_raw)
         blocks = []
         at = 0
         for number, n_packed in enumerate(packed_sizes):

@@ -125,13 +125,12 @@ def molecule_of(body: BodyRef) -> Molecule:
 def structure_of(body: BodyRef) -> gemmi.Structure:
     """Return the chains of a body as a structure; each model of a body of all models is a model."""
     gemmi = gemmi_module()
-    parts = {
-        _part(name, body.path): chains
-        for name, chains, _ in parts_of(
-            read_structures(body.path), _kind_of(body.part or ""), body.path
-        )
-    }
-    base = (body.part or "").partition(":")[0]
+    part = body.part or ""
+    structures = read_structures(body.path)
+    parts = {}
+    for name, chains, _ in parts_of(structures, _kind_of(part), body.path):
+        parts[_part(name, body.path)] = chains
+    base, _, _ = part.partition(":")
     names = [name for name in (base, f"chain {base}") if name in parts] or list(parts)
     structure = gemmi.Structure()
     for number, name in enumerate(names, 1):
@@ -148,8 +147,10 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
         options.bodies if options.bodies in ("chains", "assembly") else "models"
     )
     molecules = molecules_by_part(path, stat_key(path), bodies)
-    parts = list(molecules) if part is None else [part] * (chosen(molecules, part) is not None)
-    if part is None and options.first_model:
+    parts = list(molecules)
+    if part is not None:
+        parts = [] if chosen(molecules, part) is None else [part]
+    elif options.first_model:
         first = _model_of(parts[0])
         parts = [name for name in parts if _model_of(name) == first]
     if part is None and options.min_plddt is not None:

@@ -96,38 +96,48 @@ class FoldHistogram(SampleHistogram):
         weights, mask = _residues(places, samples, features.samples.mask)
         classes = torch.zeros(*mask.shape, 1, dtype=torch.long, device=mask.device)
         counts = count_pairs(classes, weights.unsqueeze(2), 1, pairs, mask)
-        rows = counts[:, 0, _N_NEIGHBOURS:].flatten(2)
+        counts = counts[:, 0, _N_NEIGHBOURS:]
         n_residues = mask.sum(dim=1).view(-1, 1, 1)
-        rows = rows.masked_fill(n_residues < 2, 0.0)  # without a pair
+        rows = counts.flatten(2).masked_fill(n_residues < 2, 0.0)  # without a pair
         # The sums depend on the weights of the samples, but on no other input that may have gradients.
         sums = rows.sum(dim=2, keepdim=True).detach()
         tiny = torch.finfo(sums.dtype).tiny
-        n_pairs = sums * (n_residues * (n_residues - 1) / 2)
-        far = 1 + self.separations()[_N_NEIGHBOURS:, None] / _HALF_SEPARATION
-        shares = n_pairs / (n_pairs + _FEW_PAIRS) / far
+        shares = self._shares(sums, n_residues)
         shares = shares / shares.sum(dim=1, keepdim=True).clamp_min(tiny)
         cells = rows / sums.clamp_min(tiny) * shares
-        return cells.unflatten(2, counts.shape[3:])
+        return cells.unflatten(2, counts.shape[2:])
+
+    def _shares(self, sums: Tensor, n_residues: Tensor) -> Tensor:
+        """Return the weights (N, S, 1) of the classes of separation, by their parts of all pairs of N shapes."""
+        n_pairs = sums * (n_residues * (n_residues - 1) / 2)
+        separations = self.separations()[_N_NEIGHBOURS:, None]
+        return n_pairs / (n_pairs + _FEW_PAIRS) / (1 + separations / _HALF_SEPARATION)
 
 
 def _separations(rows: Sequence[Tensor], columns: Sequence[Tensor]) -> Tensor:
     """Return the separations (N, 1, I, J) of places (N, I) and (N, J)."""
-    return (rows[0].unsqueeze(2) - columns[0].unsqueeze(1)).abs().unsqueeze(1)
+    (one,) = rows
+    (other,) = columns
+    return (one.unsqueeze(2) - other.unsqueeze(1)).abs().unsqueeze(1)
 
 
 def _rises(rows: Sequence[Tensor], columns: Sequence[Tensor]) -> Tensor:
     """Return the rises (N, 2, I, J) at the earlier and the later residue, of rises and places (N, I, 2), (N, J, 2)."""
-    one = rows[0].unsqueeze(2)
-    other = columns[0].unsqueeze(1)
-    is_earlier = one[..., 1] < other[..., 1]
-    earlier = torch.where(is_earlier, one[..., 0], other[..., 0])
-    later = torch.where(is_earlier, other[..., 0], one[..., 0])
+    (one,) = rows
+    (other,) = columns
+    rise, place = one.unsqueeze(2).unbind(dim=-1)
+    other_rise, other_place = other.unsqueeze(1).unbind(dim=-1)
+    is_earlier = place < other_place
+    earlier = torch.where(is_earlier, rise, other_rise)
+    later = torch.where(is_earlier, other_rise, rise)
     return torch.stack([earlier, later], dim=1)
 
 
 def _cosines(rows: Sequence[Tensor], columns: Sequence[Tensor]) -> Tensor:
     """Return the inner products (N, 1, I, J) of directions (N, I, 3) and (N, J, 3)."""
-    return (rows[0] @ columns[0].mT).unsqueeze(1)
+    (one,) = rows
+    (other,) = columns
+    return (one @ other.mT).unsqueeze(1)
 
 
 def _residues(places: Tensor, weights: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -138,14 +148,16 @@ def _residues(places: Tensor, weights: Tensor, mask: Tensor) -> tuple[Tensor, Te
         weights: (N, P) of the samples.
         mask: (N, P) true where a sample is real.
     """
-    is_same = (places.unsqueeze(2) == places.unsqueeze(1)) & mask.unsqueeze(1)
+    is_equal = places.unsqueeze(2) == places.unsqueeze(1)
+    is_same = is_equal & mask.unsqueeze(1)
     first = is_same.view(torch.uint8).argmax(dim=2)
     is_real = mask.to(places.dtype)
     none = torch.zeros_like(is_real)
     sums = none.scatter_add(1, first, weights.to(places.dtype) * is_real)
     n_samples = none.scatter_add(1, first, is_real)
     order = torch.arange(places.shape[1], device=places.device)
-    return sums / n_samples.clamp_min(1), mask & (first == order)
+    is_first = mask & (first == order)
+    return sums / n_samples.clamp_min(1), is_first
 
 
 def fold() -> HistogramDescriptor:

@@ -13,6 +13,7 @@ from igps._text import counted
 from igps.data.grids import Grid
 from igps.fields.molecules.molecular_surface import simplified_and_joined
 from igps.fields.volumes import images
+from igps.fields.volumes._boxes import bounds_of, box_of
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles
 from igps.mesh.errors import MeshError, NoBodyError
 from igps.mesh.formats import Format, stat_key
@@ -44,18 +45,17 @@ def map_surface(grid: Grid, threshold: float, name: str) -> Mesh:
             "Choose another by --threshold."
         )
     notes = [f"density of at least {threshold:g}"]
-    (box,) = ndimage.find_objects(inside.view(np.uint8))
-    low = [side.start for side in box]
-    high = [side.stop for side in box]
-    if 0 in low or tuple(high) != grid.values.shape:
+    low, high = bounds_of(inside)
+    if (low == 0).any() or (high != grid.values.shape).any():
         # Beyond the border there is no map, so the body ends half a voxel behind its last one
         notes.append("at the border of the map: closed there")
-    start = np.maximum(np.array(low) - 1, 0)
-    values = grid.values[tuple(map(slice, start, np.array(high) + 1))]
+    start = np.maximum(low - 1, 0)
+    values = grid.values[box_of(start, high + 1)]
     field = _in_cells(values.astype(np.float32), threshold)
-    if n_hollows := ndimage.label(field > 0)[1] - 1:
+    _, n_outside = ndimage.label(field > 0)
+    if n_outside > 1:
         field = fill_bubbles(field)
-        notes.append(f"{counted(n_hollows, 'hollow')} inside: filled")
+        notes.append(f"{counted(n_outside - 1, 'hollow')} inside: filled")
     vertices, faces = level_surface(field, name)
     points = grid.to_world(vertices - 1 + start)
     parts = connected(points, faces)
@@ -65,7 +65,7 @@ def map_surface(grid: Grid, threshold: float, name: str) -> Mesh:
         share = volumes[is_dust].sum() / volumes.sum()
         pieces = counted(int(is_dust.sum()), "small piece")
         notes.append(f"left out {pieces}, {share:.1%} of the volume")
-    kept = [part for part, is_small in zip(parts, is_dust, strict=True) if not is_small]
+    kept = [parts[i] for i in np.flatnonzero(~is_dust)]
     area = sum(float(face_areas(*part).sum()) for part in kept)
     vertices, faces = simplified_and_joined(kept, _MAX_VERTICES, notes)
     return Mesh(vertices, faces, name=name, notes=tuple(notes), unit="Å", fine_area=area)
@@ -75,8 +75,10 @@ def _in_cells(values: Singles, threshold: float) -> Singles:
     """Return about the signed distances in cells, negative inside, with a layer outside around them."""
     field = np.where(np.isfinite(values), threshold - values, np.inf)
     is_crossed = np.diff(field > 0, axis=0)
-    steps = np.abs(np.diff(np.nan_to_num(field, posinf=0.0), axis=0))[is_crossed]
-    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    finite = np.nan_to_num(field, posinf=0.0)
+    steps = np.abs(np.diff(finite, axis=0)[is_crossed])
+    steps = steps[steps > 0]
+    step = float(np.median(steps)) if len(steps) else 1.0
     field = np.clip(field / step, -4, 4)
     smallest = np.where(field <= 0, -MIN_ABS_VALUE, MIN_ABS_VALUE)
     field = np.where(np.abs(field) < MIN_ABS_VALUE, smallest, field)

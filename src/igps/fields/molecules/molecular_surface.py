@@ -38,11 +38,13 @@ SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 # Cells around the balls, and on both sides of the surface, in which distances are computed
 _MARGIN = 2.5
 _MAX_CELLS = 2**28
-# Å, distances between grid points up to so many balls, and at most
-_FINE, _N_FINE, _COARSE = 0.8, 1000, 1.0
+# Distances between grid points, Å: up to so many balls, and at most
+_FINE = 0.8
+_N_FINE = 1000
+_COARSE = 1.0
 _MAX_STEP = 0.3  # maximal step of vertices towards the surface, in cells
-# Maximal share of the area that threads between pieces add, and maximal width of a thread's end over its triangle's.
-_MAX_THREADS, _MAX_THREAD_WIDTH = 0.003, 0.5
+_MAX_THREADS = 0.003  # maximal share of the area that threads between pieces add
+_MAX_THREAD_WIDTH = 0.5  # maximal width of a thread's end over its triangle's
 _MAX_SPECKS = 0.05  # specks are dropped if they have at most this share of the volume together
 _N_DIRECTIONS = 256  # points of each sphere that tell how much of it is exposed
 _N_ROUNDS = 2  # rounds in which vertices are spread evenly along the surface
@@ -91,32 +93,34 @@ def molecular_surface(
         check_positive(spacing=spacing)
     if not 0 <= probe < math.inf:
         raise ValueError(f"probe: expected a radius of at least 0 Å, got {probe}.")
-    centres, radii = _outermost(
-        molecule.positions, molecule.radii + (0.0 if kind == "van_der_waals" else probe)
-    )
+    reach = 0.0 if kind == "van_der_waals" else probe
+    centres, radii = _outermost(molecule.positions, molecule.radii + reach)
     if spacing is None:
         spacing = float(np.clip(_FINE * math.sqrt(len(radii) / _N_FINE), _FINE, _COARSE))
     margin = _MARGIN * spacing
     low = (centres - radii[:, None]).min(axis=0) - margin
-    sides = np.ceil(((centres + radii[:, None]).max(axis=0) + margin - low) / spacing) + 1
-    if sides.prod() > _MAX_CELLS:
+    high = (centres + radii[:, None]).max(axis=0) + margin
+    sides = np.ceil((high - low) / spacing) + 1
+    n_cells = sides.prod()
+    if n_cells > _MAX_CELLS:
         limit = f"{molecule.name}: expected a grid of at most {_MAX_CELLS:.3g} cells of {spacing} Å"
-        raise MeshError(
-            f"{limit}, got {sides.prod():.3g}. Raise the spacing, or remove stray atoms."
-        )
-    shape = (int(sides[0]), int(sides[1]), int(sides[2]))
-    exact = _field(centres - low, radii, shape, spacing, probe if kind == "excluded" else 0.0)
+        raise MeshError(f"{limit}, got {n_cells:.3g}. Raise the spacing, or remove stray atoms.")
+    nx, ny, nz = (int(side) for side in sides)
+    rolling = probe if kind == "excluded" else 0.0
+    exact = _field(centres - low, radii, (nx, ny, nz), spacing, rolling)
     notes = [f"{kind.replace('_', ' ')} surface, probe {probe:g} Å, grid of {spacing:g} Å"]
     away_from_zero = np.where(exact < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE)
     bounded = np.where(np.abs(exact) < MIN_ABS_VALUE, away_from_zero, exact).astype(np.float32)
     field = bounded.copy()
-    if n_hollows := ndimage.label(field > 0)[1] - 1:
+    _, n_outside = ndimage.label(field > 0)
+    if n_outside > 1:
         field = fill_bubbles(field)
-        notes.append(f"{counted(n_hollows, 'hollow')} inside: filled")
+        notes.append(f"{counted(n_outside - 1, 'hollow')} inside: filled")
     vertices, faces = level_surface(field.copy(), molecule.name)
     vertices = _fit_to_field(np.where(field == bounded, exact, field), vertices, faces)
-    fine_area = float(face_areas(vertices, faces).sum()) * spacing**2
-    if kind != "excluded":
+    if kind == "excluded":
+        fine_area = float(face_areas(vertices, faces).sum()) * spacing**2
+    else:
         fine_area = _exposed_area(centres, radii)
     vertices, faces = _one_piece(vertices, faces, max_vertices, notes)
     return Mesh(
@@ -135,10 +139,11 @@ def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
     order = order[radii[order] > 0]
     centres = centres[order]
     radii = radii[order]
-    pairs = cKDTree(centres).query_pairs(radii[0] - radii[-1] + 1e-6, output_type="ndarray")
-    small = pairs.max(axis=1)
-    distance = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
-    is_inside = distance + radii[small] <= radii[pairs.min(axis=1)] + 1e-9
+    reach = radii[0] - radii[-1] + 1e-6
+    pairs = cKDTree(centres).query_pairs(reach, output_type="ndarray")
+    large, small = np.sort(pairs, axis=1).T
+    distance = np.linalg.norm(centres[large] - centres[small], axis=1)
+    is_inside = distance + radii[small] <= radii[large] + 1e-9
     is_outermost = np.ones(len(radii), dtype=bool)
     is_outermost[small[is_inside]] = False
     return centres[is_outermost], radii[is_outermost]
@@ -171,16 +176,16 @@ def _exposed_area(centres: Floats, radii: Floats) -> float:
 
 def _neighbours(centres: Floats, radii: Floats) -> tuple[Integers, Integers]:
     """Return the neighbours of ball i, which intersect it, as `neighbours[first[i]:first[i + 1]]`, nearest first."""
-    pairs = cKDTree(centres).query_pairs(2 * radii.max(), output_type="ndarray")
-    distance = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
-    meets = distance < radii[pairs].sum(axis=1)
-    a, b = pairs[meets].T
-    ball = np.r_[a, b]
-    neighbour = np.r_[b, a]
-    distance = distance[meets]
-    first = np.zeros(len(radii) + 1, dtype=np.int64)
-    np.cumsum(np.bincount(ball, minlength=len(radii)), out=first[1:])
-    return first, neighbour[np.lexsort((np.r_[distance, distance], ball))].astype(np.int64)
+    one, other = cKDTree(centres).query_pairs(2 * radii.max(), output_type="ndarray").T
+    distance = np.linalg.norm(centres[one] - centres[other], axis=1)
+    meets = distance < radii[one] + radii[other]
+    ball = np.concatenate([one[meets], other[meets]])
+    neighbour = np.concatenate([other[meets], one[meets]])
+    both = np.tile(distance[meets], 2)
+    order = np.lexsort((both, ball))
+    n_neighbours = np.bincount(ball, minlength=len(radii))
+    first = np.concatenate([[0], np.cumsum(n_neighbours)])
+    return first, neighbour[order].astype(np.int64)
 
 
 def _one_piece(
@@ -190,29 +195,28 @@ def _one_piece(
     parts = connected(vertices, faces)
     volumes = np.array([abs(signed_volume(*part)) for part in parts])
     is_speck = volumes < SPECK_VOLUME * volumes.sum()
-    if (
-        volumes[is_speck].sum() > _MAX_SPECKS * volumes.sum()
-    ):  # as of a membrane, which consists of small molecules
-        is_speck[:] = False
+    if volumes[is_speck].sum() > _MAX_SPECKS * volumes.sum():
+        is_speck[:] = False  # as of a membrane, which consists of small molecules
     elif is_speck.any():
         notes.append(f"left out {counted(int(is_speck.sum()), 'speck')}")
-    parts = [part for part, is_small in zip(parts, is_speck, strict=True) if not is_small]
-    return simplified_and_joined(parts, max_vertices, notes)
+    kept = [parts[i] for i in np.flatnonzero(~is_speck)]
+    return simplified_and_joined(kept, max_vertices, notes)
 
 
 def simplified_and_joined(
     parts: Sequence[Surface], max_vertices: int | None, notes: list[str]
 ) -> Surface:
     """Simplify each closed piece to its share of the vertices, and join them by threads to one surface."""
-    if max_vertices is not None:
-        n_vertices = sum(len(points) for points, _ in parts)
-        parts = [
-            simplify_surface(*part, max(round(max_vertices * len(part[0]) / n_vertices), 12))
-            for part in parts
-        ]
-    if len(parts) > 1:
-        notes.append(f"joined {len(parts)} pieces by threads")
-    return _join(parts)
+    simple = []
+    n_all = sum(len(vertices) for vertices, _ in parts)
+    for vertices, faces in parts:
+        if max_vertices is not None:
+            n_own = round(max_vertices * len(vertices) / n_all)
+            vertices, faces = simplify_surface(vertices, faces, max(n_own, 12))
+        simple.append((vertices, faces))
+    if len(simple) > 1:
+        notes.append(f"joined {len(simple)} pieces by threads")
+    return _join(simple)
 
 
 def _fit_to_field(field: Singles, vertices: Floats, faces: Integers) -> Floats:
@@ -224,26 +228,30 @@ def _fit_to_field(field: Singles, vertices: Floats, faces: Integers) -> Floats:
     steps, normals = _steps(field, vertices)
     vertices = vertices - steps
     for _ in range(_N_ROUNDS):
-        shift = means_at_vertices(vertices[faces].mean(axis=1), vertices, faces) - vertices
-        vertices = vertices + shift - np.einsum("ij,ij->i", shift, normals)[:, None] * normals
+        centres = vertices[faces].mean(axis=1)
+        shift = means_at_vertices(centres, vertices, faces) - vertices
+        across = np.einsum("ij,ij->i", shift, normals)
+        vertices = vertices + shift - across[:, None] * normals
         steps, normals = _steps(field, vertices)
         vertices = vertices - steps
-    steps, normals = _steps(field, vertices[faces].mean(axis=1))
+    centres = vertices[faces].mean(axis=1)
+    steps, normals = _steps(field, centres)
     heights = np.einsum("ij,ij->i", steps, normals)[:, None]
     # Average at the vertices and back, so that neighbours move alike.
     heights = means_at_vertices(heights, vertices, faces)[faces].mean(axis=1)
-    return vertices - 0.75 * means_at_vertices(heights, vertices, faces) * vertex_normals(
-        vertices, faces
-    )
+    heights = means_at_vertices(heights, vertices, faces)
+    return vertices - 0.75 * heights * vertex_normals(vertices, faces)
 
 
 def _steps(field: Singles, points: Floats) -> tuple[Floats, Floats]:
     """Return the vectors (P, 3) from the surface to the points, in cells, and the outward normals (P, 3) there."""
     values = cubic_values(field, points)
+    gradients = values[:, 1:]
     # The gradient of a distance has length 1. Where it is much shorter, as midway between two surfaces, it is useless.
-    slope = np.maximum(np.linalg.norm(values[:, 1:], axis=1), 0.5)
-    normals = values[:, 1:] / slope[:, None]
-    return np.clip(values[:, 0] / slope, -_MAX_STEP, _MAX_STEP)[:, None] * normals, normals
+    slope = np.maximum(np.linalg.norm(gradients, axis=1), 0.5)
+    normals = gradients / slope[:, None]
+    heights = np.clip(values[:, 0] / slope, -_MAX_STEP, _MAX_STEP)
+    return heights[:, None] * normals, normals
 
 
 def _join(parts: Sequence[Surface]) -> Surface:
@@ -251,7 +259,8 @@ def _join(parts: Sequence[Surface]) -> Surface:
     vertices, faces = stacked(parts)
     links = _shortest_links([points for points, _ in parts])
     length = sum(float(np.linalg.norm(vertices[a] - vertices[b])) for a, b in links)
-    girth = _MAX_THREADS * float(face_areas(vertices, faces).sum()) / max(length, 1e-300)
+    area = float(face_areas(vertices, faces).sum())
+    girth = _MAX_THREADS * area / max(length, 1e-300)
     for a, b in links:
         vertices, faces = _add_thread(vertices, faces, a, b, girth)
     return vertices, faces
@@ -259,56 +268,59 @@ def _join(parts: Sequence[Surface]) -> Surface:
 
 def _shortest_links(parts: Sequence[Floats]) -> list[tuple[int, int]]:
     """Return the minimum spanning tree of the parts (Prim) as pairs of vertices, numbered through all parts."""
-    trees = [cKDTree(points) for points in parts]
-    links = []
     starts = np.cumsum([0, *map(len, parts)]).tolist()
-    # Shortest link of each part that is not yet in the tree
-    best = dict.fromkeys(range(1, len(parts)), (np.inf, 0, 0))
+    links = []
+    # Of each part that is not yet in the tree: its distance, and the shortest link to it
+    distances = dict.fromkeys(range(1, len(parts)), math.inf)
+    best: dict[int, tuple[int, int]] = {}
     new = 0
-    while best:
-        for j in best:
-            distance, vertex = trees[new].query(parts[j])
+    while distances:
+        tree = cKDTree(parts[new])
+        for other in distances:
+            distance, vertex = tree.query(parts[other])
             nearest = int(distance.argmin())
-            if distance[nearest] < best[j][0]:
-                best[j] = (
-                    float(distance[nearest]),
-                    starts[new] + int(vertex[nearest]),
-                    starts[j] + nearest,
-                )
-        new = min(best, key=lambda j: best[j][0])
-        links.append(best.pop(new)[1:])
+            if distance[nearest] < distances[other]:
+                distances[other] = float(distance[nearest])
+                best[other] = (starts[new] + int(vertex[nearest]), starts[other] + nearest)
+        new = min(distances, key=distances.__getitem__)
+        links.append(best[new])
+        del distances[new]
     return links
 
 
 def _add_thread(vertices: Floats, faces: Integers, a: int, b: int, girth: float) -> Surface:
     """Add a thread, a tube of triangular section, between the largest triangles at two vertices."""
     areas = face_areas(vertices, faces)
-    ends = [
-        int(at[areas[at].argmax()])
-        for at in (np.flatnonzero((faces == v).any(axis=1)) for v in (a, b))
-    ]
+    ends = []
     rims = []
     new = []
-    for end, face in enumerate(ends):
-        corners = vertices[faces[face]]
+    for vertex in (a, b):
+        around = np.flatnonzero((faces == vertex).any(axis=1))
+        end = int(around[areas[around].argmax()])
+        corners = vertices[faces[end]]
         centre = corners.mean(axis=0)
         perimeter = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
-        vertices = np.concatenate(
-            [vertices, centre + min(girth / perimeter, _MAX_THREAD_WIDTH) * (corners - centre)]
-        )
-        rims.append(len(vertices) - 3 + np.arange(3))
-        for i, k in ((0, 1), (1, 2), (2, 0)):
-            c = faces[face][i]
-            d = faces[face][k]
-            e = rims[end][k]
-            f = rims[end][i]
-            new += [(c, d, e), (c, e, f)]
+        width = min(girth / perimeter, _MAX_THREAD_WIDTH)
+        rim = len(vertices) + np.arange(3)
+        vertices = np.concatenate([vertices, centre + width * (corners - centre)])
+        new += _band(faces[end], rim)
+        ends.append(end)
+        rims.append(rim)
+    one, other = rims
+
+    def length(rim: Integers) -> float:
+        return float(np.linalg.norm(vertices[one] - vertices[rim], axis=1).sum())
+
     # The rims face each other, so they run in opposite directions.
-    rotations = [np.roll(rims[1][::-1], k) for k in range(3)]
-    other = min(
-        rotations,
-        key=lambda rim: float(np.linalg.norm(vertices[rims[0]] - vertices[rim], axis=1).sum()),
-    )
+    rotations = [np.roll(other[::-1], k) for k in range(3)]
+    new += _band(one, min(rotations, key=length))
+    kept = np.delete(faces, ends, axis=0)
+    return vertices, np.concatenate([kept, np.array(new, dtype=np.int64)])
+
+
+def _band(one: Integers, other: Integers) -> list[tuple[int, int, int]]:
+    """Return the six triangles between two triangles of vertices that run in the same direction."""
+    band = []
     for i, k in ((0, 1), (1, 2), (2, 0)):
-        new += [(rims[0][i], rims[0][k], other[k]), (rims[0][i], other[k], other[i])]
-    return vertices, np.concatenate([np.delete(faces, ends, axis=0), np.array(new, dtype=np.int64)])
+        band += [(one[i], one[k], other[k]), (one[i], other[k], other[i])]
+    return band

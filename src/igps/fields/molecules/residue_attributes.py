@@ -64,15 +64,17 @@ def residue_means(molecule: Molecule, points: Floats, values: Floats) -> Floats:
 
     Unknown values (NaN) are left out; the mean is NaN if no value is known near a point.
     """
-    known = np.isfinite(values)
-    filled = np.where(known, values, 0)
+    is_known = np.isfinite(values)
+    filled = np.where(is_known, values, 0)
     means = np.empty((len(points), values.shape[1]))
     for block in _blocks(len(points), len(values)):
         squares = cdist(points[block], molecule.residue_positions, "sqeuclidean")
+        nearest = squares.min(axis=1, keepdims=True)
         # Relative to the weight of the nearest residue, so that not all weights vanish far outside.
-        weights = np.exp((squares.min(axis=1, keepdims=True) - squares) / (2 * WIDTH**2))
-        total = weights @ known.astype(float)
-        means[block] = np.where(total > 0, weights @ filled / np.where(total > 0, total, 1), np.nan)
+        weights = np.exp((nearest - squares) / (2 * WIDTH**2))
+        total = weights @ is_known.astype(float)
+        total[total == 0] = np.nan
+        means[block] = weights @ filled / total
     return means
 
 
@@ -131,12 +133,10 @@ def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
 
 def _by_name(table: Mapping[str, float], default: float = np.nan) -> Callable[[Molecule], Floats]:
     """Return a function for values (R, 1) by residue name: the default for amino acids not in the table, else NaN."""
+    complete = {**dict.fromkeys(VOLUMES, default), **table}
 
     def column(molecule: Molecule) -> Floats:
-        values = [
-            table.get(name, default if name in VOLUMES else np.nan)
-            for name in molecule.residue_names
-        ]
+        values = [complete.get(name, np.nan) for name in molecule.residue_names]
         return np.array(values, dtype=float)[:, None]
 
     return column
@@ -150,10 +150,10 @@ def _charges(molecule: Molecule) -> Floats:
 def _kinds(molecule: Molecule) -> Floats:
     """Return the kind of each residue as a one-hot row (R, 25)."""
     index = {name: i for i, name in enumerate(RESIDUE_KINDS)}
-    index |= {f"D{base}": index[base] for base in "ACG"} | {"DT": index["U"], "T": index["U"]}
-    return np.eye(len(RESIDUE_KINDS))[
-        [index.get(name, index["other"]) for name in molecule.residue_names]
-    ]
+    index |= {f"D{base}": index[base] for base in "ACG"}
+    index |= dict.fromkeys(("DT", "T"), index["U"])
+    kinds = [index.get(name, index["other"]) for name in molecule.residue_names]
+    return np.eye(len(RESIDUE_KINDS))[kinds]
 
 
 _COLUMNS: Mapping[str, Callable[[Molecule], Floats]] = {

@@ -28,16 +28,18 @@ def residue_correspondence(one: BodyRef, other: BodyRef) -> Correspondence | Non
     """
     if not (is_structure(one.path) and is_structure(other.path)):
         return None
-    molecules = [molecule_of(body) for body in (one, other)]
-    first, second = (molecule.residue_names for molecule in molecules)
-    if len(first) * len(second) > _MAX_CELLS:
+    first = molecule_of(one)
+    second = molecule_of(other)
+    names = first.residue_names
+    other_names = second.residue_names
+    if len(names) * len(other_names) > _MAX_CELLS:
         return None
-    pairs = aligned(first, second)
-    n_same = sum(first[i] == second[j] for i, j in pairs)
-    if n_same < max(3, _MIN_IDENTITY * min(len(first), len(second))):
+    pairs = aligned(names, other_names)
+    n_same = sum(names[i] == other_names[j] for i, j in pairs)
+    n_shorter = min(len(names), len(other_names))
+    if n_same < max(3, _MIN_IDENTITY * n_shorter):
         return None
-    places = (_places(one, molecules[0]), _places(other, molecules[1]))
-    return Correspondence("residues", places, pairs)
+    return Correspondence("residues", (_places(one, first), _places(other, second)), pairs)
 
 
 def aligned(one: tuple[str, ...], other: tuple[str, ...]) -> Integers:
@@ -48,22 +50,23 @@ def aligned(one: tuple[str, ...], other: tuple[str, ...]) -> Integers:
     pairs = [np.empty((0, 2), dtype=np.int64)]
     place = np.zeros(2, dtype=np.int64)
     for count, kind in re.findall(r"(\d+)([MID])", steps):
-        run = np.arange(int(count))[:, None]
-        advance = {"M": [1, 1], "I": [1, 0], "D": [0, 1]}[kind]
+        n = int(count)
         if kind == "M":
-            pairs.append(place + run)
-        place = place + int(count) * np.array(advance)
+            pairs.append(place + np.arange(n)[:, None])
+        advance = {"M": [1, 1], "I": [1, 0], "D": [0, 1]}[kind]
+        place = place + n * np.array(advance)
     return np.concatenate(pairs)
 
 
 def _places(body: BodyRef, molecule: Molecule) -> Places:
-    names = tuple(
-        f"{label} {name}"
-        for label, name in zip(molecule.residue_labels, molecule.residue_names, strict=True)
-    )
-    save = partial(save_structure, body, molecule)
+    residues = zip(molecule.residue_labels, molecule.residue_names, strict=True)
     return Places(
-        names, molecule.residue_positions, molecule.positions, molecule.residue_of, ".cif", save
+        tuple(f"{label} {name}" for label, name in residues),
+        molecule.residue_positions,
+        molecule.positions,
+        molecule.residue_of,
+        ".cif",
+        partial(save_structure, body, molecule),
     )
 
 

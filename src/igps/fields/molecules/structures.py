@@ -150,10 +150,12 @@ class _Builder:
         self._count: Counter[str] = Counter()
 
     def molecule(self, name: str, notes: list[str]) -> Molecule:
-        origin = ["radii and charges are those of the PQR file"] if self.is_pqr else []
-        counted = [
-            text.format(self._count[key]) for key, text in _NOTES.items() if self._count[key]
-        ]
+        remarks = list(notes)
+        if self.is_pqr:
+            remarks.append("radii and charges are those of the PQR file")
+        for key, text in _NOTES.items():
+            if self._count[key]:
+                remarks.append(text.format(self._count[key]))
         positions, radii, charges, residue_of = map(np.array, zip(*self.balls, strict=True))
         names, centres, b_factors, numbers, chains, labels = zip(*self._residues, strict=True)
         places = chain_places(np.array(centres), np.array(numbers), np.array(chains))
@@ -166,7 +168,7 @@ class _Builder:
             names,
             np.array(centres),
             np.array(b_factors),
-            (*notes, *origin, *counted),
+            tuple(remarks),
             places,
             labels,
         )
@@ -234,7 +236,8 @@ class _Builder:
         """Return the van der Waals radius of the atom's element, inferred from its name if need be."""
         if atom.element.atomic_number:
             return float(atom.element.vdw_r)
-        if (letter := _first_letter(atom)) in _INFERRED_ELEMENTS:
+        letter = _first_letter(atom)
+        if letter in _INFERRED_ELEMENTS:
             self._count["named"] += 1
             return float(gemmi_module().Element(letter).vdw_r)
         self._count["element"] += 1

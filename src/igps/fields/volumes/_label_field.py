@@ -9,7 +9,6 @@ with less weight on bending (creases: Blake and Zisserman 1987).
 The zero level is later shifted as a whole to match the volume of the voxels: local shifts would restore the stairs.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers, Singles
 from igps._compiled import REASSOCIATE, compiled
+from igps.fields.volumes._boxes import block_corners, bounds_of, box_of
 
 # Minimal absolute value of the function at voxels wholly inside or outside, in shortest sides (0.5 is the largest that
 # all bodies allow), and weight of the second derivatives; each in smooth places and at edges. The values for smooth
@@ -27,10 +27,8 @@ _STIFFNESS = (1.0, 0.1)
 # second on it is an edge. An edge bends more than the faces beside it; a thin round body bends everywhere.
 _BEND_LIMITS = (0.05, 0.2)
 # Standard deviations of the means of the Laplacian and of its surroundings, voxels
-_WINDOW, _WIDE_WINDOW = (
-    0.7,
-    3.0,
-)
+_WINDOW = 0.7
+_WIDE_WINDOW = 3.0
 # Weight of the deviation from a signed distance to the voxels of the other side; the second derivatives have weight 1.
 _DISTANCE_WEIGHT = 0.01
 _RELAXATION = 1.4
@@ -58,28 +56,28 @@ def smooth_field(share: Singles, sides: Floats) -> Floats | Singles:
     margin = np.ceil(PAD * sides.max() / sides).astype(np.int64)
     overlap = np.maximum(margin, _OVERLAP)
     field = np.full(share.shape, far, dtype=np.float32)
-    for corner in np.ndindex(*(math.ceil(n / _BLOCK) for n in share.shape)):
-        low = _BLOCK * np.array(corner)
+    for low in block_corners(share.shape, _BLOCK):
         high = np.minimum(low + _BLOCK, share.shape)
         start = np.maximum(low - overlap, 0)
-        inside = share[tuple(map(slice, start, high + overlap))] >= 0.5
+        inside = share[box_of(start, high + overlap)] >= 0.5
         if not inside.any():
             continue
         if inside.all():
-            field[tuple(map(slice, low, high))] = -far
+            field[box_of(low, high)] = -far
             continue
-        (box,) = ndimage.find_objects(inside.view(np.uint8))
-        first, last = (start + [getattr(side, end) for side in box] for end in ("start", "stop"))
-        box_low = np.maximum(first - margin, start)
-        box_high = np.minimum(last + margin, start + inside.shape)
-        padding = list(zip(margin - (first - box_low), margin - (box_high - last), strict=True))
-        solution = _solve(np.pad(share[tuple(map(slice, box_low, box_high))], padding), sides)
-        origin = first - margin  # of the solution, in the grid
-        a = np.maximum(low, box_low)
-        b = np.minimum(high, box_high)
-        if (a < b).all():
-            block = solution[tuple(map(slice, a - origin, b - origin))]
-            field[tuple(map(slice, a, b))] = np.clip(block, -far, far)
+        # The body in the block and its overlap, with a margin: of the share, or else of zeros.
+        first, last = bounds_of(inside)
+        origin = start + first - margin
+        end = start + last + margin
+        read_from = np.maximum(origin, start)
+        read_to = np.minimum(end, start + inside.shape)
+        padding = np.stack([read_from - origin, end - read_to], axis=1)
+        solution = _solve(np.pad(share[box_of(read_from, read_to)], padding), sides)
+        kept_from = np.maximum(low, read_from)
+        kept_to = np.minimum(high, read_to)
+        if (kept_from < kept_to).all():
+            kept = solution[box_of(kept_from - origin, kept_to - origin)]
+            field[box_of(kept_from, kept_to)] = np.clip(kept, -far, far)
     return field
 
 
@@ -89,13 +87,8 @@ def _solve(share: Singles, sides: Floats) -> Floats:
     distance = ndimage.distance_transform_edt(inside, sampling=sides)
     distance += ndimage.distance_transform_edt(~inside, sampling=sides)
     field = np.where(inside, -1.0, 1.0) * (distance - 0.5)
-    border = ndimage.maximum_filter(inside, 2 * _BAND + 1) & ~ndimage.minimum_filter(
-        inside, 2 * _BAND + 1
-    )
-    nodes = np.flatnonzero(border)
-    target = field.reshape(-1)[nodes]
-    stencil = np.array([-1.0, 2, -1])
     laplacian = np.zeros_like(field)
+    stencil = np.array([-1.0, 2, -1])
     for axis, side in enumerate(sides):
         laplacian += ndimage.correlate1d(field, stencil / side**2, axis)
     steps = np.array(field.strides) // field.itemsize
@@ -104,22 +97,27 @@ def _solve(share: Singles, sides: Floats) -> Floats:
         np.concatenate([[0], steps, -steps]),
         np.concatenate([[2 * curvatures.sum()], -curvatures, -curvatures]),
     )
-    certainty = np.abs(2 * share - 1).reshape(-1)[nodes]
+    width = 2 * _BAND + 1
+    near_body = ndimage.maximum_filter(inside, width)
+    deep_inside = ndimage.minimum_filter(inside, width)
+    border = near_body & ~deep_inside
+    nodes = np.flatnonzero(border)
+    target = field.ravel()[nodes]
+    certainty = np.abs(2 * share - 1).ravel()[nodes]
 
     def relax(sharpness: Floats) -> None:
-        min_abs = certainty * np.interp(sharpness.reshape(-1)[nodes], (0, 1), _MIN_ABS_VALUES)
-        stiffness = np.interp(sharpness, (0, 1), _STIFFNESS).reshape(-1)
-        bounded = _Nodes(nodes, target, inside.reshape(-1)[nodes], min_abs)
+        min_abs = np.interp(sharpness.ravel()[nodes], (0, 1), _MIN_ABS_VALUES)
+        stiffness = np.interp(sharpness, (0, 1), _STIFFNESS).ravel()
+        bounded = _Nodes(nodes, target, inside.ravel()[nodes], certainty * min_abs)
         _relax(field.reshape(-1), laplacian.reshape(-1), weighted, stiffness, bounded)
 
     relax(np.zeros_like(field))
-    # Edges are blunter across long voxels.
-    bend = np.abs(ndimage.gaussian_filter(laplacian, _WINDOW, truncate=3)) * np.sqrt(sides.max())
-    around, weight = (
-        ndimage.gaussian_filter(values, _WIDE_WINDOW, truncate=3)
-        for values in (bend * border, border.astype(float))
-    )
-    relax(np.interp(bend - around / np.maximum(weight, 1e-3), _BEND_LIMITS, (0, 1)))
+    bend = np.abs(ndimage.gaussian_filter(laplacian, _WINDOW, truncate=3))
+    bend *= np.sqrt(sides.max())  # edges are blunter across long voxels
+    total = ndimage.gaussian_filter(bend * border, _WIDE_WINDOW, truncate=3)
+    weight = ndimage.gaussian_filter(border.astype(float), _WIDE_WINDOW, truncate=3)
+    excess = bend - total / np.maximum(weight, 1e-3)
+    relax(np.interp(excess, _BEND_LIMITS, (0, 1)))
     return field
 
 
@@ -128,18 +126,20 @@ def filled_volume(field: Floats | Singles, reach: float) -> tuple[float, float]:
 
     Voxels with values beyond `reach` lie wholly on one side.
     """
-    near = np.nonzero(np.abs(field[1:-1, 1:-1, 1:-1]) < reach)
-    at = np.ravel_multi_index(tuple(index + 1 for index in near), field.shape)
-    values = field.reshape(-1)
+    is_near = np.zeros(field.shape, dtype=bool)
+    is_near[1:-1, 1:-1, 1:-1] = np.abs(field[1:-1, 1:-1, 1:-1]) < reach
+    at = np.flatnonzero(is_near)
+    flat = field.reshape(-1)
+    values = flat[at]
     width = np.full(len(at), 1e-3)
-    for step in np.cumprod(
-        [1, *field.shape[:0:-1]]
-    ).tolist():  # not its strides: splines permute the axes in memory
-        width += np.abs(values[at + step] - values[at - step]) / 2
-    share = 0.5 - values[at] / width
-    n_full = np.count_nonzero(field < 0) - np.count_nonzero(values[at] < 0)
+    _, n_rows, n_columns = field.shape
+    for step in (1, n_columns, n_columns * n_rows):  # to the next voxel along each axis
+        width += np.abs(flat[at + step] - flat[at - step]) / 2
+    share = 0.5 - values / width
+    n_full = np.count_nonzero(field < 0) - np.count_nonzero(values < 0)
     is_cut = (share > 0) & (share < 1)
-    return float(np.clip(share, 0, 1).sum()) + n_full, float((1 / width[is_cut]).sum())
+    volume = float(np.clip(share, 0, 1).sum()) + n_full
+    return volume, float((1 / width[is_cut]).sum())
 
 
 class _Stencil(NamedTuple):

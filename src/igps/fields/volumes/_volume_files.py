@@ -202,15 +202,17 @@ def _simple_itk(path: Path) -> RawVolume:
     n_layers = reader.GetNumberOfComponents() if segments else 1
     if "complex" in SimpleITK.GetPixelIDValueAsString(reader.GetPixelID()):
         raise _not_integers(path, "complex numbers")
-    check_voxels(
-        path, reader.GetSize(), 8 * n_layers, 1 if segments else reader.GetNumberOfComponents()
-    )
-    n_bytes = math.prod(reader.GetSize()) * reader.GetNumberOfComponents() * _value_bytes(reader)
+    n_components = reader.GetNumberOfComponents()
+    n_values = 1 if segments else n_components
+    check_voxels(path, reader.GetSize(), 8 * n_layers, n_values)
+    n_bytes = math.prod(reader.GetSize()) * n_components * _value_bytes(reader)
     with _checked(path, n_bytes) as sound:
         reader.SetFileName(str(sound))
         image = reader.Execute()
     values = SimpleITK.GetArrayFromImage(image)  # (Z, Y, X) or (Z, Y, X, layers)
-    layers = [values[..., i].T for i in range(values.shape[3])] if values.ndim == 4 else [values.T]
+    layers = [values.T]
+    if values.ndim == 4:
+        layers = [layer.T for layer in np.moveaxis(values, 3, 0)]
     affine = np.eye(4)
     affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
     affine[:3, 3] = image.GetOrigin()
@@ -327,10 +329,11 @@ def _segments(metadata: dict[str, str]) -> list[tuple[str, int, int]]:
     for number in sorted({match[1] for match in matches if match}, key=int):
         value = metadata.get(f"Segment{number}_LabelValue", "").strip()
         # Before 3D Slicer 4.11, each segment had the value 1 in its own layer
-        layer = metadata.get(f"Segment{number}_Layer", "0" if value else number).strip()
+        text = metadata.get(f"Segment{number}_Layer", "0" if value else number).strip()
+        layer = int(text) if text.isdigit() else 0
         if not value or value.isdigit():
             name = metadata.get(f"Segment{number}_Name", "")
-            segments.append((name, int(layer) if layer.isdigit() else 0, int(value or 1)))
+            segments.append((name, layer, int(value or 1)))
     return segments
 
 
@@ -394,17 +397,16 @@ def _highdicom(path: Path) -> RawVolume:
         check_voxels(path, geometry.spatial_shape, 8 * len(numbers))
         # The failed attempt keeps tables of the first object locked
         segmentation = Segmentation.from_dataset(pydicom.dcmread(path), copy=False)
-        layers = [
-            np.asarray(segmentation.get_volume(segment_numbers=[n]).array)[..., 0] for n in numbers
-        ]
-    is_separate = (len(layers) == len(numbers) and len(numbers) > 1) or layers[0].dtype.kind == "f"
-    names = [str(segmentation.get_segment_description(number).segment_label) for number in numbers]
-    places = (
-        [(layer, 1) for layer in range(len(numbers))]
-        if is_separate
-        else [(0, number) for number in numbers]
-    )
-    segments = [(name, *place) for name, place in zip(names, places, strict=True)]
+        layers = []
+        for number in numbers:
+            volume = segmentation.get_volume(segment_numbers=[number])
+            layers.append(np.asarray(volume.array)[..., 0])
+    is_fractional = layers[0].dtype.kind == "f"
+    is_separate = is_fractional or len(layers) == len(numbers) > 1
+    segments = []
+    for layer, number in enumerate(numbers):
+        name = str(segmentation.get_segment_description(number).segment_label)
+        segments.append((name, layer, 1) if is_separate else (name, 0, number))
     # Axes of the arrays: slices, rows, columns, as in the affine of `geometry`
     affine = _LPS_TO_RAS @ np.array(geometry.affine, dtype=np.float64)
     return RawVolume(layers, affine, segments=segments, unit_from="format")
@@ -419,25 +421,23 @@ def _tifffile(path: Path) -> RawVolume:
         axes = series.axes
         dtype = np.dtype(series.dtype)
         if "S" in axes:
-            check_voxels(path, series.shape[:3], dtype.itemsize, series.shape[axes.index("S")])
+            n_samples = series.shape[axes.index("S")]
+            check_voxels(path, series.shape[:3], dtype.itemsize, n_samples)
         if dtype.kind not in "biuf":
             raise _not_integers(path, str(dtype))
-        shape = [n for n in series.shape if n > 1] if len(series.shape) > 3 else list(series.shape)
+        shape = list(series.shape)
+        if len(shape) > 3:
+            shape = [n for n in shape if n > 1]
         pages = [series]
         if len(shape) < 3:  # slices that were written one by one
-            pages = [
-                page
-                for page in file.series
-                if (page.shape, page.dtype) == (series.shape, series.dtype)
-            ]
+            layout = (series.shape, series.dtype)
+            pages = [page for page in file.series if (page.shape, page.dtype) == layout]
             shape = [len(pages), *shape]
         check_voxels(path, shape, dtype.itemsize)
         try:
-            values = (
-                series.asarray()
-                if len(pages) == 1
-                else np.stack([page.asarray() for page in pages])
-            )
+            values = series.asarray()
+            if len(pages) > 1:
+                values = np.stack([page.asarray() for page in pages])
         except ValueError as error:
             if "imagecodecs" not in str(error):
                 raise
@@ -488,27 +488,23 @@ def _tiff_sides(file: Any) -> tuple[tuple[float, float, float], str | None]:
             scale = unit_of_length(unit[1] if unit else "µm")
             if size and scale:
                 known[axis] = float(size[1]) * scale
-        return (
-            ((known["X"], known["Y"], known["Z"]), "mm")
-            if len(known) == 3
-            else ((1.0, 1.0, 1.0), None)
-        )
+        if len(known) < 3:
+            return (1.0, 1.0, 1.0), None
+        return (known["X"], known["Y"], known["Z"]), "mm"
     metadata = file.imagej_metadata
     tags = file.pages[0].tags
     if metadata is None:
         return (1.0, 1.0, 1.0), None
-    # ImageJ omits resolutions of 1. Without a unit the ratios of the sides still hold
-    resolutions = [
-        tags[name].value if (name := f"{axis}Resolution") in tags else (1, 1) for axis in "XY"
-    ]
-    x, y = (length / n if n and length else 1.0 for n, length in resolutions)
+    sides = []
+    for name in ("XResolution", "YResolution"):
+        n, length = tags[name].value if name in tags else (1, 1)  # ImageJ omits resolutions of 1
+        sides.append(length / n if n and length else 1.0)
+    sides.append(abs(float(metadata.get("spacing", 1))) or 1.0)
     scale = unit_of_length(str(metadata.get("unit")))
-    factor = scale or 1.0
-    return (
-        factor * x,
-        factor * y,
-        factor * (abs(float(metadata.get("spacing", 1))) or 1.0),
-    ), "mm" if scale else None
+    x, y, z = sides
+    if not scale:  # the ratios of the sides still hold
+        return (x, y, z), None
+    return (scale * x, scale * y, scale * z), "mm"
 
 
 READERS: dict[str, Callable[[Path], RawVolume]] = {

@@ -33,15 +33,19 @@ def border_notes(voxels: LabelVoxels, area: float, frame: Frame) -> tuple[str, .
     sides = []
     cut_area = 0.0
     for axis in range(3):
+        forward = axes[:, axis]
         first, second = np.delete(axes, axis, axis=1).T
         face_area = np.linalg.norm(np.cross(first, second))
-        ends = ((0, is_first[axis], -axes[:, axis]), (-1, is_last[axis], axes[:, axis]))
-        for index, is_at_border, outward in ends:
-            if is_at_border:
-                n_faces = np.count_nonzero(voxels.mask.take(index, axis=axis))
-                cut_area += float(n_faces * face_area)
-                world_axis = int(np.argmax(np.abs(outward)))
-                sides.append((world_axis, int(outward[world_axis] > 0)))
+        ends = []
+        if is_first[axis]:
+            ends.append((0, -forward))
+        if is_last[axis]:
+            ends.append((-1, forward))
+        for index, outward in ends:
+            n_faces = np.count_nonzero(voxels.mask.take(index, axis=axis))
+            cut_area += float(n_faces * face_area)
+            world_axis = int(np.argmax(np.abs(outward)))
+            sides.append((world_axis, int(outward[world_axis] > 0)))
     if not sides:
         return ()
     names = ", ".join(_SIDES[frame][axis][end] for axis, end in sorted(sides))

@@ -82,9 +82,12 @@ def _read_map(path: Path) -> tuple[NDArray[Any], Floats]:
         head = np.frombuffer(file.read(96), "<i4")
     if len(head) < 24:
         raise MeshError(f"{path}: expected a header of 1024 bytes. Export it again.")
-    head = head.byteswap() if not 0 <= head[3] < 256 else head
+    if not 0 <= head[3] < 256:
+        head = head.byteswap()
     n_values = math.prod(map(int, head[:3]))
-    n_expected = 1024 + max(int(head[23]), 0) + n_values * _MODE_BYTES.get(int(head[3]), 1)
+    value_bytes = _MODE_BYTES.get(int(head[3]), 1)
+    extended_header = max(int(head[23]), 0)
+    n_expected = 1024 + extended_header + n_values * value_bytes
     n_bytes = n_expected if is_packed else path.stat().st_size
     if min(head[:3]) < 1 or n_bytes < n_expected:
         raise MeshError(f"{path}: expected {n_expected} bytes, got {n_bytes}. Export it again.")
@@ -104,12 +107,12 @@ def _read_map(path: Path) -> tuple[NDArray[Any], Floats]:
             raise MeshError(
                 f"{path}: expected real numbers in voxels of known size, got {kind}. Export it again."
             )
-        starts = np.array([int(header[name]) for name in ("nxstart", "nystart", "nzstart")])[
-            np.argsort(along)
-        ]
+        starts = np.array([int(header[name]) for name in ("nxstart", "nystart", "nzstart")])
+        starts = starts[np.argsort(along)]
         # If a file has both origin and starts, they state the same position, and most programs use the origin
         origin = np.array(header.origin.item(), dtype=float)
         affine = np.eye(4)
         affine[:3, :3] = np.diag(sides)
         affine[:3, 3] = origin if origin.any() else starts * sides
-        return np.array(values.transpose(np.argsort(along[::-1]))), affine
+        order = np.argsort(along[::-1])
+        return np.array(values.transpose(order)), affine

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers
+from igps.fields.volumes._boxes import TOUCHING, block_corners, bounds_of, box_of
 from igps.mesh.raw_body import LabelVoxels
 
 # A label is as thick as a ball if balls of that size that fit inside it cover this share of its voxels.
@@ -31,7 +32,7 @@ class VoxelMeasures:
 
 def measure(voxels: LabelVoxels) -> VoxelMeasures:
     """Measure the voxels of a label."""
-    n_pieces = ndimage.label(voxels.mask, np.ones((3, 3, 3)))[1]
+    _, n_pieces = ndimage.label(voxels.mask, TOUCHING)
     n_voxels = int(np.count_nonzero(voxels.mask))
     return VoxelMeasures(n_voxels, int(n_pieces), thinnest_part(voxels.mask))
 
@@ -46,14 +47,15 @@ def voxel_numbers(mask: Booleans, affine: Floats) -> dict[str, float]:
     from skimage.measure import euler_number
 
     axes = affine[:3, :3]
-    spacing = np.linalg.norm(axes, axis=0)
+    x, y, z = np.linalg.norm(axes, axis=0).tolist()
+    _, n_pieces = ndimage.label(mask, TOUCHING)
     return {
         "voxel_volume": float(np.count_nonzero(mask) * abs(np.linalg.det(axes))),
-        "n_pieces": float(ndimage.label(mask, np.ones((3, 3, 3)))[1]),
+        "n_pieces": float(n_pieces),
         "euler_number": float(euler_number(mask, connectivity=3)),
-        "spacing_x": float(spacing[0]),
-        "spacing_y": float(spacing[1]),
-        "spacing_z": float(spacing[2]),
+        "spacing_x": x,
+        "spacing_y": y,
+        "spacing_z": z,
     }
 
 
@@ -63,35 +65,38 @@ def thinnest_part(mask: Booleans) -> int:
     n_voxels = np.count_nonzero(mask)
     cube = _MAX_DIAMETER + 1
     # Where cubes fit, balls do; cubes are found much faster.
-    cubes = ndimage.maximum_filter(ndimage.minimum_filter(mask, cube), cube)
-    if np.count_nonzero(cubes) >= _MIN_COVERED * n_voxels:
+    centres = ndimage.minimum_filter(mask, cube)
+    in_cubes = ndimage.maximum_filter(centres, cube)
+    if np.count_nonzero(in_cubes) >= _MIN_COVERED * n_voxels:
         return _MAX_DIAMETER
     # An even thickness has its middle between voxels
     parts = 2 if mask.size < _MIN_WHOLE_VOXELS else 1
     for axis in range(3):
         mask = np.repeat(mask, parts, axis=axis)
-    radii = [float(d) if parts == 2 else (d + 1) / 2 for d in range(2, _MAX_DIAMETER + 1)]
+    diameters = range(2, _MAX_DIAMETER + 1)
+    radii = [float(d) if parts == 2 else (d + 1) / 2 for d in diameters]
     min_depths = [math.ceil(r**2) for r in radii]  # squared depth of the centre of a ball that fits
     reach = [math.ceil(_NEAR * r**2) for r in radii]
+    max_uncovered = (1 - _MIN_COVERED) * parts**3 * n_voxels
     n_uncovered = np.zeros(len(radii), dtype=np.int64)
-    for corner in np.ndindex(*(math.ceil(n / _BLOCK) for n in mask.shape)):
-        first = _BLOCK * np.array(corner)
-        boxes = ndimage.find_objects(mask[tuple(map(slice, first, first + _BLOCK))].view(np.uint8))
-        if not boxes:
+    for corner in block_corners(mask.shape, _BLOCK):
+        block = mask[box_of(corner, corner + _BLOCK)]
+        if not block.any():
             continue
-        low, high = (first + [getattr(side, end) for side in boxes[0]] for end in ("start", "stop"))
-        block = mask[tuple(map(slice, low, high))]
+        first, last = bounds_of(block)
+        low = corner + first
+        high = corner + last
+        block = mask[box_of(low, high)]
         start, stop = _widen(low, high, reach[-1])
         start, stop = _widen(start, stop, min_depths[-1])
-        depth = _squared_distances(mask[tuple(map(slice, start, stop))], min_depths[-1])
+        depth = _squared_distances(mask[box_of(start, stop)], min_depths[-1])
         for k in range(len(radii)):
             begin, end = _widen(low, high, reach[k])
-            is_no_centre = depth[tuple(map(slice, begin - start, end - start))] < min_depths[k]
-            to_centre = _squared_distances(is_no_centre, reach[k])[
-                tuple(map(slice, low - begin, high - begin))
-            ]
-            n_uncovered[k] += np.count_nonzero(block & (to_centre == reach[k]))
-            if n_uncovered[k] > (1 - _MIN_COVERED) * parts**3 * n_voxels:
+            is_no_centre = depth[box_of(begin - start, end - start)] < min_depths[k]
+            to_centre = _squared_distances(is_no_centre, reach[k])
+            is_far = to_centre[box_of(low - begin, high - begin)] == reach[k]
+            n_uncovered[k] += np.count_nonzero(block & is_far)
+            if n_uncovered[k] > max_uncovered:
                 radii = radii[:k]  # larger balls need not be tried
                 break
     return 1 + len(radii)
@@ -113,7 +118,8 @@ def _squared_distances(mask: Booleans, max_value: int) -> NDArray[np.unsignedint
     for axis in range(3):
         lines = np.moveaxis(squares, axis, 0)
         nearest = lines.copy()
-        for step in range(1, min(math.isqrt(max_value - 1) + 1, len(lines))):
+        n_steps = min(math.isqrt(max_value - 1) + 1, len(lines))
+        for step in range(1, n_steps):
             moved = lines + number(step**2)
             np.minimum(nearest[step:], moved[:-step], out=nearest[step:])
             np.minimum(nearest[:-step], moved[step:], out=nearest[:-step])

@@ -19,6 +19,9 @@ logger = logging.getLogger(__name__)
 
 _SUFFIXES = (".label", ".ctbl", ".lut", ".txt", ".csv", ".tsv", ".json")  # of tables for one volume
 _FOLDER_TABLES = ("FreeSurferColorLUT.txt", "dataset.json")  # for all volumes of a folder
+# Columns of tables, those first that win
+_LABEL_COLUMNS = ("labelvalue", "label", "index", "id", "value")
+_NAME_COLUMNS = ("name", "label_name", "labelname")
 _MAX_BYTES = 1 << 24
 BUILT_IN = {
     path.stem: path for path in sorted(Path(__file__).with_name("label_tables").glob("*.csv"))
@@ -107,7 +110,8 @@ def names_in_extensions(contents: Iterable[bytes]) -> dict[int, str]:
     names: dict[int, str] = {}
     for content in contents:
         for attributes, name in _WORKBENCH.findall(content):
-            if key := _KEY.search(attributes):
+            key = _KEY.search(attributes)
+            if key is not None:
                 inner = re.sub(rb"<!\[CDATA\[(.*?)\]\]>", rb"\1", name, flags=re.DOTALL)
                 names[int(key[1])] = html.unescape(inner.decode("utf-8", "replace"))
     return cleaned(names)
@@ -120,23 +124,24 @@ def cleaned(names: dict[int, str]) -> dict[int, str]:
 
 
 def _parse_lines(text: str) -> dict[int, str]:
-    lines = (line.strip() for line in text.splitlines())
-    rows = (_SNAP.match(line) or _FSLEYES.match(line) or _COLOURS.match(line) for line in lines)
-    return cleaned({int(row[1]): row[2].strip('"') for row in rows if row})
+    names = {}
+    for line in text.splitlines():
+        line = line.strip()
+        row = _SNAP.match(line) or _FSLEYES.match(line) or _COLOURS.match(line)
+        if row is not None:
+            names[int(row[1])] = row[2].strip('"')
+    return cleaned(names)
 
 
 def _parse_csv(text: str) -> dict[int, str]:
     rows = csv.DictReader(text.splitlines(), delimiter=delimiter_of(text))
     columns = {(column or "").strip().lower(): column for column in rows.fieldnames or ()}
-    labels = next(
-        (columns[key] for key in ("labelvalue", "label", "index", "id", "value") if key in columns),
-        None,
-    )
-    names = next(
-        (columns[key] for key in ("name", "label_name", "labelname") if key in columns), None
-    )
-    if labels is None or names is None:
+    of_labels = [columns[key] for key in _LABEL_COLUMNS if key in columns]
+    of_names = [columns[key] for key in _NAME_COLUMNS if key in columns]
+    if not of_labels or not of_names:
         return {}
+    labels = of_labels[0]
+    names = of_names[0]
     numbered: dict[int, str] = {}
     for row in rows:
         number = _whole_number(str(row[labels] or ""))

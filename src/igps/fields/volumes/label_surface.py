@@ -15,6 +15,7 @@ from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers, Singles, Surface
 from igps._text import counted
+from igps.fields.volumes._boxes import TOUCHING, bounds_of, box_of
 from igps.fields.volumes._label_field import PAD, filled_volume, smooth_field
 from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles, join_pieces
 from igps.mesh.errors import MeshError, NoBodyError
@@ -35,7 +36,6 @@ class TooFewVoxelsError(NoBodyError):
     summary = f"of fewer than {MIN_VOXELS} voxels"
 
 
-_TOUCHING = np.ones((3, 3, 3), dtype=bool)  # voxels that share a corner are connected
 _ISLAND = 0.02  # separate pieces of less than this share of the voxels are dropped
 _MIN_OPEN_CAVITY = 0.1  # share of the voxels from which an open cavity is noted
 _SPECK = 0.005  # pieces of the surface of less than this share of the volume are artefacts between voxels
@@ -97,11 +97,12 @@ def voxel_surface(
         raise TooFewVoxelsError(
             f"{name}: {few}. Leave out the label, or segment it on a finer grid."
         )
-    (box,) = ndimage.find_objects(mask.view(np.uint8))
-    low = np.array([side.start for side in box], dtype=np.float64)
+    low, high = bounds_of(mask)
+    mask = mask[box_of(low, high)]
     notes: list[str] = []
-    mask = mask[box]
-    voxel = Voxel(abs(float(np.linalg.det(matrix[:3, :3]))), unit)
+    axes = matrix[:3, :3]
+    signed_size = float(np.linalg.det(axes))
+    voxel = Voxel(abs(signed_size), unit)
     mask, hollows = _clean(mask, notes, MIN_VOXELS if cavities else None, name, voxel)
     n_open = _n_nearly_enclosed(mask) if cavities else 0
     if n_open > _MIN_OPEN_CAVITY * np.count_nonzero(mask):
@@ -111,15 +112,19 @@ def voxel_surface(
     share, factor = _coarsen(mask, spacing, max_vertices)
     volume = float(share.sum(dtype=np.float64))  # before contacts are thickened, which adds volume
     mask = _thicken_contacts(share >= 0.5)
-    share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
+    at_least_half = np.maximum(share, np.float32(0.5))
+    share = np.pad(np.where(mask, at_least_half, share), PAD)
     check_grid(share.size, name)
-    sides = spacing * factor / (spacing * factor).min()  # nothing depends on the unit of length
+    sides = spacing * factor
+    sides = sides / sides.min()  # nothing depends on the unit of length
     field = smooth_field(share, sides)
     # Each side is divided so that its parts are about equal and give enough vertices.
     n_vertices = _n_vertices(mask, sides)
-    refinement = min(max(math.ceil(math.sqrt(_MIN_VERTICES / n_vertices)), 1), _MAX_REFINEMENT)
+    wanted = math.ceil(math.sqrt(_MIN_VERTICES / n_vertices))
+    refinement = min(max(wanted, 1), _MAX_REFINEMENT)
     n_parts = np.maximum(np.round(refinement * sides / sides.min()), 1).astype(np.int64)
-    field = _refine(field, share, n_parts, sides / n_parts)
+    cell = sides / n_parts
+    field = _refine(field, share, n_parts, cell)
     n_cells = volume * float(n_parts.prod())
     if joins and ndimage.label(mask)[1] > 1:
         n_before = np.count_nonzero(field < 0)
@@ -127,14 +132,12 @@ def voxel_surface(
         radius = _BAR * math.sqrt(n_vertices / 1.5) * refinement
         field = join_pieces(field.astype(np.float32, copy=False), notes, radius)
         n_cells += np.count_nonzero(field < 0) - n_before
-    vertices, faces = _mesh(
-        field, sides / n_parts, n_cells * (sides / n_parts).prod(), max_vertices, name
-    )
+    vertices, faces = _mesh(field, cell, n_cells * cell.prod(), max_vertices, name)
     # The centre of a block of `factor` voxels lies (factor - 1) / 2 beyond that of its first voxel.
     index = (vertices / sides - PAD) * factor + (factor - 1) / 2 + low
-    if np.linalg.det(matrix[:3, :3]) < 0:
+    if signed_size < 0:
         faces = np.ascontiguousarray(faces[:, ::-1])
-    surfaces = [(index @ matrix[:3, :3].T + matrix[:3, 3], faces)]
+    surfaces = [(index @ axes.T + matrix[:3, 3], faces)]
     matrix = matrix @ np.block([[np.eye(3), low[:, None]], [np.zeros(3), 1]])
     for hollow in hollows:
         points, triangles, cavity_notes = voxel_surface(
@@ -151,11 +154,10 @@ def voxel_spacing(affine: Floats, name: str) -> Floats:
         raise MeshError(
             f"{name}: affine: expected a finite matrix of shape (4, 4), got {affine.tolist()}."
         )
-    spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    if (
-        not spacing.all()
-        or abs(np.linalg.det(affine[:3, :3] / np.where(spacing, spacing, 1))) < 1e-6
-    ):
+    axes = affine[:3, :3]
+    spacing = np.linalg.norm(axes, axis=0)
+    directions = axes / np.where(spacing, spacing, 1)
+    if not spacing.all() or abs(np.linalg.det(directions)) < 1e-6:
         raise MeshError(
             f"{name}: the affine is singular. Write the file again with spacing and axes of the voxels."
         )
@@ -183,16 +185,17 @@ def _clean(
     label, island, size = _islands(mask)
     if len(island):
         n_dropped = int(size[island].sum())
-        if 2 * n_dropped >= size.sum():  # such as lesions
-            share = f"{name}: {n_dropped / size.sum():.0%} of the voxels lie in {len(island)} separate pieces"
+        dropped = n_dropped / size.sum()
+        if dropped >= 0.5:  # such as lesions
+            fault = f"{name}: {dropped:.0%} of the voxels lie in {len(island)} separate pieces"
             remedy = 'Read each piece as a body: LoadOptions(bodies="pieces"), --bodies pieces; or connect the pieces.'
             raise MeshError(
-                f"{share}, each below {_ISLAND:.0%} of the label; one body was expected. {remedy}"
+                f"{fault}, each below {_ISLAND:.0%} of the label; one body was expected. {remedy}"
             )
         mask = mask & ~np.isin(label, island)
-        share = f"{n_dropped / size.sum():.1%} of the label"
         pieces = counted(len(island), "small piece")
-        notes.append(f"left out {pieces} apart: {voxel.amount(n_dropped)}, {share}")
+        amount = voxel.amount(n_dropped)
+        notes.append(f"left out {pieces} apart: {amount}, {dropped:.1%} of the label")
     # Voxels outside are connected only across faces.
     hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
     if n_hollow < 2:
@@ -202,24 +205,28 @@ def _clean(
     size = np.bincount(hollow.reshape(-1))
     size[[0, outside]] = 0
     cavities = [] if min_hole is None else np.flatnonzero(size >= min_hole).tolist()
-    if n_filled := int(size.sum() - size[cavities].sum()):
+    n_filled = int(size.sum() - size[cavities].sum())
+    if n_filled:
         notes.append(f"filled holes: {voxel.amount(n_filled)}")
     return np.asarray(hollow != outside), [hollow == k for k in cavities]
 
 
 def _n_nearly_enclosed(mask: Booleans) -> int:
     """Count the voxels outside a body that it encloses if it is thickened by one voxel."""
-    label, _ = ndimage.label(~ndimage.binary_dilation(np.pad(mask, 2), _TOUCHING))
+    thick = ndimage.binary_dilation(np.pad(mask, 2), TOUCHING)
+    label, _ = ndimage.label(~thick)
     size = np.bincount(label.reshape(-1))
-    return int(size[1:].sum() - size[label[0, 0, 0]])
+    outside = label[0, 0, 0]
+    return int(size[1:].sum() - size[outside])
 
 
 def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
     """Return the piece of each voxel, from 1; the pieces too small to keep; and the number of voxels of each piece."""
-    label, _ = ndimage.label(mask, _TOUCHING)
+    label, _ = ndimage.label(mask, TOUCHING)
     size = np.bincount(label.reshape(-1))
     size[0] = 0
-    return label, np.nonzero(size < _ISLAND * size.sum())[0][1:], size
+    small = np.flatnonzero(size < _ISLAND * size.sum())
+    return label, small[1:], size  # without the background
 
 
 def _thicken_contacts(mask: Booleans) -> Booleans:
@@ -234,9 +241,8 @@ def _thicken_contacts(mask: Booleans) -> Booleans:
             offset = np.array(step) - 1
             if np.abs(offset).sum() < 2 or tuple(offset) < (0, 0, 0):
                 continue
-            moved = padded[
-                tuple(slice(1 + d, 1 + d + n) for d, n in zip(offset, mask.shape, strict=True))
-            ]
+            start = np.array(step)
+            moved = padded[box_of(start, start + mask.shape)]
             at = np.argwhere((label > 0) & (moved > 0) & (label != moved))
             for axis in np.nonzero(offset)[0][:-1]:
                 at[:, axis] += offset[axis]
@@ -249,11 +255,13 @@ def _thicken_contacts(mask: Booleans) -> Booleans:
 
 def _n_vertices(mask: Booleans, sides: Floats) -> float:
     """Estimate how many vertices marching cubes make on a grid as fine as the shortest side."""
-    masks = [np.moveaxis(mask, axis, 0) for axis in range(3)]
-    n_cuts = np.array(
-        [np.count_nonzero(m[1:] != m[:-1]) + np.count_nonzero(m[[0, -1]]) for m in masks]
-    )
-    return float((n_cuts * sides.prod() / sides).sum() / sides.min() ** 2)
+    area = 0.0
+    for axis, side in enumerate(sides):
+        layers = np.moveaxis(mask, axis, 0)
+        n_inside = np.count_nonzero(layers[1:] != layers[:-1])
+        n_at_border = np.count_nonzero(layers[[0, -1]])
+        area += (n_inside + n_at_border) * sides.prod() / side
+    return float(area / sides.min() ** 2)
 
 
 def _coarsen(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Singles, Integers]:
@@ -262,21 +270,21 @@ def _coarsen(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Single
 
     share = mask.astype(np.float32)
     factor = np.ones(3, dtype=np.int64)
-    n_pieces = ndimage.label(mask, _TOUCHING)[1]
+    n_pieces = ndimage.label(mask, TOUCHING)[1]
     while _n_vertices(mask, spacing * factor) > _MAX_SURPLUS * max_vertices:
         sides = spacing * factor
         is_halved = sides < 1.5 * sides.min()
         if not _is_thick(mask, is_halved):
             break
-        # Exact in single precision
-        coarse = block_reduce(share, tuple(np.where(is_halved, 2, 1)), np.mean)
+        block = np.where(is_halved, 2, 1)
+        coarse = block_reduce(share, tuple(block), np.mean)  # exact in single precision
         # Drop small pieces that were connected only by threads too thin for the coarse grid.
         label, island, size = _islands(coarse >= 0.5)
         if np.count_nonzero(size) - len(island) != n_pieces:
             break
-        coarse[np.isin(label, island) & (label > 0)] = 0
+        coarse[np.isin(label, island)] = 0
         share = coarse
-        factor = factor * np.where(is_halved, 2, 1)
+        factor = factor * block
         mask = np.asarray(coarse >= 0.5)
     return share, factor
 
@@ -285,7 +293,8 @@ def _is_thick(mask: Booleans, axes: Booleans) -> bool:
     """Return whether nearly all of the body is at least three voxels thick along the axes."""
     core = ndimage.minimum_filter(mask, tuple(np.where(axes, 3, 1)), mode="constant")
     is_thick = ndimage.maximum_filter(core, tuple(np.where(axes, 5, 1)), mode="constant")
-    return bool(np.count_nonzero(mask & ~is_thick) <= _MAX_THIN * np.count_nonzero(mask))
+    n_thin = np.count_nonzero(mask & ~is_thick)
+    return bool(n_thin <= _MAX_THIN * np.count_nonzero(mask))
 
 
 def _refine(
@@ -295,7 +304,8 @@ def _refine(
     from scipy.interpolate import CubicSpline
 
     inside = share >= 0.5
-    for axis, n in enumerate(n_parts.tolist()):
+    steps = n_parts.tolist()
+    for axis, n in enumerate(steps):
         if n > 1:
             index = np.arange(field.shape[axis])
             spline = CubicSpline(index, field, axis=axis, bc_type="natural")
@@ -306,15 +316,14 @@ def _refine(
         filled, slope = filled_volume(field, float(sides.sum()))
         field -= (volume - filled) / max(slope, 1e-9)
     # Make the field negative between neighbours in the body, so that they stay connected.
-    for axis, n in enumerate(n_parts.tolist()):
+    for axis, n in enumerate(steps):
         both = inside & np.roll(inside, -1, axis)
         for part in range(n):
-            at = tuple(
-                slice(part if k == axis else 0, None, step)
-                for k, step in enumerate(n_parts.tolist())
-            )
-            line = field[at]
-            line[both[tuple(slice(size) for size in line.shape)] & (line > -min_abs)] = -min_abs
+            slices = [slice(None, None, step) for step in steps]
+            slices[axis] = slice(part, None, n)
+            line = field[tuple(slices)]
+            joined = both[tuple(map(slice, line.shape))]
+            line[joined & (line > -min_abs)] = -min_abs
     return field
 
 
@@ -324,21 +333,21 @@ def _mesh(
     """Mesh the zero level of a field as closed pieces of this volume; the sides of a cell are about equal."""
     cell = float(sides.min())
     min_abs = MIN_ABS_VALUE * cell
-    level = np.where(field < 0, np.minimum(field, -min_abs), np.maximum(field, min_abs)) / cell
-    vertices, faces = level_surface(fill_bubbles(level.astype(np.float32, copy=False)), name)
+    bounded = np.where(field < 0, np.minimum(field, -min_abs), np.maximum(field, min_abs))
+    level = fill_bubbles((bounded / cell).astype(np.float32, copy=False))
+    vertices, faces = level_surface(level, name)
     vertices = vertices * (sides / cell)
     pieces = connected(vertices, faces)
-    volumes = np.abs([signed_volume(*piece) for piece in pieces])
+    volumes = [signed_volume(*piece) for piece in pieces]
+    speck = _SPECK * np.abs(volumes).sum()
     parts = []
-    for piece in [
-        piece for piece, size in zip(pieces, volumes, strict=True) if size > _SPECK * volumes.sum()
-    ]:
-        if signed_volume(*piece) < 0:
-            piece = piece[0], piece[1][:, ::-1]
-        parts.append(
-            simplify_surface(*piece, max(round(max_vertices * len(piece[0]) / len(vertices)), 50))
-        )
+    for (points, triangles), own in zip(pieces, volumes, strict=True):
+        if abs(own) <= speck:
+            continue
+        if own < 0:
+            triangles = triangles[:, ::-1]
+        n_own = round(max_vertices * len(points) / len(vertices))
+        parts.append(simplify_surface(points, triangles, max(n_own, 50)))
     points, triangles = stacked(parts)
-    return restore_volume(points, triangles, volume / cell**3) * cell, np.ascontiguousarray(
-        triangles
-    )
+    points = restore_volume(points, triangles, volume / cell**3)
+    return points * cell, np.ascontiguousarray(triangles)

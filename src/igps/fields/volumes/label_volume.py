@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from igps._arrays import Booleans, Floats
 from igps._text import counted
+from igps.fields.volumes._boxes import TOUCHING
 from igps.fields.volumes._volume_files import (
     READERS,
     RawVolume,
@@ -37,7 +38,9 @@ from igps.mesh.raw_body import LabelVoxels, RawBody, UnitSource, deferred
 
 # Volumes with more values than _MAX_LABELS are refused as images. So are those with more than _MAX_UNCHECKED values if
 # less than a share _MIN_EQUAL of adjacent voxels are equal; labels as thin as two voxels have a share of one half.
-_MAX_LABELS, _MAX_UNCHECKED, _MIN_EQUAL = 20_000, 50, 0.3
+_MAX_LABELS = 20_000
+_MAX_UNCHECKED = 50
+_MIN_EQUAL = 0.3
 # Distance of a label from a whole number: NIfTI may store labels as scaled integers
 _LABEL_TOLERANCE = 0.01
 # Share of its voxels' volume by which a surface may differ without a note
@@ -94,7 +97,8 @@ class LabelVolume:
             )
         seen: dict[str, int] = {}  # a given name may equal one that was made distinct by its number
         for body in self.bodies:
-            if (other := seen.setdefault(body.name, body.label)) != body.label:
+            other = seen.setdefault(body.name, body.label)
+            if other != body.label:
                 both = f"labels {other} and {body.label} are both named {body.name!r}"
                 raise MeshError(f"{self.name}: {both}. Rename one, or give names by a table.")
 
@@ -108,26 +112,31 @@ class LabelVolume:
             for value, n_voxels, box in _count_labels(labels, self.name):
                 label = known.get(value, value if len(self.layers) == 1 else None)
                 if label is not None:
-                    bodies.append(
-                        LabelBody(label, names.get(label, str(label)), n_voxels, layer, value, box)
-                    )
+                    name = names.get(label, str(label))
+                    bodies.append(LabelBody(label, name, n_voxels, layer, value, box))
         uses = Counter(body.name for body in bodies)
-        distinct = (
-            replace(x, name=f"{x.name} ({x.label})") if uses[x.name] > 1 else x for x in bodies
-        )
+        distinct = []
+        for body in bodies:
+            if uses[body.name] > 1:
+                body = replace(body, name=f"{body.name} ({body.label})")
+            distinct.append(body)
         return tuple(sorted(distinct, key=lambda body: body.label))
 
     def body(self, part: int | str) -> LabelBody:
         """Return the body of a label or name; if there is none, a MeshError lists the names."""
-        by_key: dict[int | str, LabelBody] = {str(body.label): body for body in self.bodies}
+        bodies = self.bodies
+        by_key: dict[int | str, LabelBody] = {str(body.label): body for body in bodies}
         # Names win over the numbers of other labels: teeth have numbers as names
-        by_key |= {key: body for body in self.bodies for key in (body.label, body.name)}
+        by_key |= {body.label: body for body in bodies}
+        by_key |= {body.name: body for body in bodies}
         if part in by_key:
             return by_key[part]
-        known = ", ".join(body.name for body in self.bodies[:10]) + (
-            ", …" if len(self.bodies) > 10 else ""
+        known = [body.name for body in bodies[:10]]
+        if len(bodies) > 10:
+            known.append("…")
+        raise MeshError(
+            f"{self.name}: no label {part!r}. It has {len(bodies)}: {', '.join(known)}."
         )
-        raise MeshError(f"{self.name}: no label {part!r}. It has {len(self.bodies)}: {known}.")
 
     def mask(self, part: int | str) -> Booleans:
         """Return the mask of a label within its `LabelBody.box`."""
@@ -137,9 +146,8 @@ class LabelVolume:
     def voxels(self, part: int | str) -> LabelVoxels:
         """Return the mask of a label with its place in the volume."""
         low = np.array([side.start for side in self.body(part).box])
-        return LabelVoxels(
-            self.mask(part), low, self.layers[0].shape, np.asarray(self.affine, dtype=np.float64)
-        )
+        affine = np.asarray(self.affine, dtype=np.float64)
+        return LabelVoxels(self.mask(part), low, self.layers[0].shape, affine)
 
 
 def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) -> LabelVolume:
@@ -221,14 +229,16 @@ def _reoriented(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
     """Permute and flip the axes to run as nearly along x, y, z as possible, whatever order a format stores them in."""
     from scipy.optimize import linear_sum_assignment
 
-    cosines = np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0)
+    axes = affine[:3, :3]
+    cosines = np.abs(axes) / np.linalg.norm(axes, axis=0)
     _, order = linear_sum_assignment(-cosines)
     mask = mask.transpose(order)
     affine = affine[:, [*order, 3]]
-    for axis in np.nonzero(np.diag(affine)[:3] < 0)[0]:
-        affine[:3, 3] += affine[:3, axis] * (mask.shape[axis] - 1)
-        affine[:3, axis] *= -1
-        mask = np.flip(mask, int(axis))
+    for axis in range(3):
+        if affine[axis, axis] < 0:
+            affine[:3, 3] += affine[:3, axis] * (mask.shape[axis] - 1)
+            affine[:3, axis] *= -1
+            mask = np.flip(mask, axis)
     return np.ascontiguousarray(mask), affine
 
 
@@ -241,16 +251,12 @@ def _labelled(
     segments = None
     names = raw.names
     if raw.segments:
-        # The same value may stand for different segments in different layers
-        values = [value for _, _, value in raw.segments]
-        labels = values if len(set(values)) == len(values) else list(range(1, len(values) + 1))
-        segments = tuple(
-            (label, layer, value)
-            for label, (_, layer, value) in zip(labels, raw.segments, strict=True)
-        )
-        names = cleaned(
-            {label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True)}
-        )
+        titles, places, values = zip(*raw.segments, strict=True)
+        labels = values
+        if len(set(values)) < len(values):  # the same one stands for segments in different layers
+            labels = tuple(range(1, len(values) + 1))
+        segments = tuple(zip(labels, places, values, strict=True))
+        names = cleaned(dict(zip(labels, titles, strict=True)))
     is_chosen = options.names is not None and options.names not in BUILT_IN
     if is_chosen or not names:
         names = _names_of(layers, options.names, path, has_segments=bool(raw.segments))
@@ -275,11 +281,13 @@ def _names_of(
     table = names_table(path, given)
     if table is not None and table not in BUILT_IN.values():
         return read_label_names(table)
-    label = int(layers[0].max(initial=0))
-    is_mask = label in (1, 255) and bool(((layers[0] == 0) | (layers[0] == label)).all())
-    if path is not None and is_mask and not has_segments:
-        return {label: path.name[: -len(suffix_of(path))]}
-    return read_label_names(table) if table is not None else {}
+    values = layers[0]
+    label = int(values.max(initial=0))
+    if path is not None and label in (1, 255) and not has_segments:
+        is_mask = ((values == 0) | (values == label)).all()
+        if is_mask:
+            return {label: path.name[: -len(suffix_of(path))]}
+    return {} if table is None else read_label_names(table)
 
 
 def _integer_labels(
@@ -289,32 +297,29 @@ def _integer_labels(
     whole = _whole_numbers(values)
     if whole is not None:
         return whole
-    if values.dtype.kind == "f":
-        if n_bad := int(np.count_nonzero(~np.isfinite(values))):
-            raise MeshError(
-                f"{name}: {n_bad} voxels are NaN or infinite, expected labels. Set them to 0."
-            )
-        slabs = values.T if values.flags.f_contiguous else values  # a copy of all may be too large
-        odd = np.concatenate(
-            [np.empty(0), *(x[np.abs(x - np.rint(x)) > _LABEL_TOLERANCE] for x in slabs)]
-        )
+    is_float = values.dtype.kind == "f"
+    fractions = _fractions(values, name) if is_float else np.empty(0)
+    if len(fractions):
         # Probabilities may leave [0, 1]: SPM stores bytes times a rounded 1/255, and resampling overshoots
-        if len(odd) and values.min() >= -_LABEL_TOLERANCE and values.max() <= 1 + _LABEL_TOLERANCE:
-            threshold = 0.5 if threshold is None else threshold
-            if not 0 < threshold <= 1:
-                raise MeshError(
-                    f"{name}: threshold: expected above 0 and at most 1 for probabilities, got {threshold:g}."
-                )
-            notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
-            return (values >= threshold).astype(np.uint8)
-        if len(odd):
-            fault = f"{name}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}."
+        if values.min() < -_LABEL_TOLERANCE or values.max() > 1 + _LABEL_TOLERANCE:
+            fault = (
+                f"{name}: {len(fractions)} voxels have fractional labels, such as {fractions[0]:g}."
+            )
             raise MeshError(
                 f"{fault} Resample to the nearest neighbour, or give probabilities between 0 and 1."
             )
-    low, high = (int(np.rint(values.min())), int(np.rint(values.max()))) if values.size else (0, 0)
+        threshold = 0.5 if threshold is None else threshold
+        if not 0 < threshold <= 1:
+            raise MeshError(
+                f"{name}: threshold: expected above 0 and at most 1 for probabilities, got {threshold:g}."
+            )
+        notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
+        return (values >= threshold).astype(np.uint8)
+    low = int(np.rint(values.min(initial=0)))
+    high = int(np.rint(values.max(initial=0)))
     if low < 0:
-        fault = f"{name}: {int(np.count_nonzero(values <= -0.5))} voxels have negative labels, such as {low}"
+        n_negative = int(np.count_nonzero(values <= -0.5))
+        fault = f"{name}: {n_negative} voxels have negative labels, such as {low}"
         raise MeshError(
             f"{fault}; expected 0 and positive numbers. Export the labels if it is an image."
         )
@@ -322,16 +327,32 @@ def _integer_labels(
         raise MeshError(
             f"{name}: label {high} is too large, expected less than 2³¹. Renumber the labels."
         )
-    if values.dtype.kind != "f":
-        return np.asarray(values, dtype=np.min_scalar_type(high))
-    return np.rint(
-        values, out=np.empty_like(values, dtype=np.min_scalar_type(high)), casting="unsafe"
-    )
+    smallest_type = np.min_scalar_type(high)
+    if not is_float:
+        return np.asarray(values, dtype=smallest_type)
+    labels = np.empty_like(values, dtype=smallest_type)
+    return np.rint(values, out=labels, casting="unsafe")
+
+
+def _fractions(values: NDArray[Any], name: str) -> NDArray[Any]:
+    """Return the values that are no whole numbers; a MeshError if some are not finite."""
+    n_bad = int(np.count_nonzero(~np.isfinite(values)))
+    if n_bad:
+        raise MeshError(
+            f"{name}: {n_bad} voxels are NaN or infinite, expected labels. Set them to 0."
+        )
+    found = [np.empty(0)]
+    for slab in values.T if values.flags.f_contiguous else values:  # all at once may be too large
+        is_fraction = np.abs(slab - np.rint(slab)) > _LABEL_TOLERANCE
+        found.append(slab[is_fraction])
+    return np.concatenate(found)
 
 
 def _whole_numbers(values: NDArray[Any]) -> NDArray[Any] | None:
     """Return values as bytes if they are whole numbers below 256, as nearly all labels are; None if not."""
-    if not values.size or not (values.min() >= 0 and values.max() <= np.iinfo(np.uint8).max):
+    if not values.size:
+        return None
+    if not (values.min() >= 0 and values.max() <= np.iinfo(np.uint8).max):
         return None  # also if some are NaN
     whole = values.astype(np.uint8)
     return whole if np.array_equal(whole, values) else None
@@ -344,43 +365,45 @@ def _count_labels(labels: ArrayLike, name: str) -> Iterable[tuple[int, int, Box]
         raise MeshError(
             f"{name}: expected whole numbers of shape (X, Y, Z), got {array.dtype} of shape {array.shape}."
         )
-    array = array.view(np.uint8) if array.dtype.kind == "b" else array
-    if array.size and array.min() < 0:
-        raise MeshError(f"{name}: expected labels from 0, got {array.min()}. Renumber them.")
-    if not array.size or array.max() < 2**16:
-        counts = np.zeros(int(array.max(initial=0)) + 1, dtype=np.int64)
-        for plane in array.T if array.flags.f_contiguous else array:  # as they lie in memory
+    if array.dtype.kind == "b":
+        array = array.view(np.uint8)
+    low = array.min(initial=0)
+    high = int(array.max(initial=0))
+    if low < 0:
+        raise MeshError(f"{name}: expected labels from 0, got {low}. Renumber them.")
+    is_reversed = array.flags.f_contiguous
+    numbered = array.T if is_reversed else array  # as it lies in memory: half the time
+    if high < 2**16:
+        counts = np.zeros(high + 1, dtype=np.int64)
+        for plane in numbered:
             counts += np.bincount(plane.ravel(), minlength=len(counts))
         counts[0] = 0
-        values = np.nonzero(counts)[0]
-        numbered = array
+        values = np.flatnonzero(counts)
         counts = counts[values]
     else:
-        values, index, counts = np.unique(array, return_inverse=True, return_counts=True)
+        values, index, counts = np.unique(numbered, return_inverse=True, return_counts=True)
         start = int(values[0] == 0)
-        numbered = index.reshape(array.shape) + (1 - start)
         values = values[start:]
         counts = counts[start:]
+        numbered = index.reshape(numbered.shape) + (1 - start)
     n = len(values)
     if n > _MAX_LABELS or (n > _MAX_UNCHECKED and _is_speckled(array, values[counts.argmax()])):
         raise MeshError(
             f"{name}: {n} values, which look like an image and not like labels. Export the labels."
         )
-    if numbered.flags.f_contiguous:  # half the time
-        found = [box and box[::-1] for box in ndimage.find_objects(numbered.T)]
-    else:
-        found = ndimage.find_objects(numbered)
-    boxes = [box for box in found if box is not None]
+    boxes = [box for box in ndimage.find_objects(numbered) if box is not None]
+    if is_reversed:
+        boxes = [box[::-1] for box in boxes]
     return zip(values.tolist(), counts.tolist(), boxes, strict=True)
 
 
 def _is_speckled(labels: NDArray[Any], most_frequent: int) -> bool:
     """Return whether few neighbours along x are equal, without the background and the most frequent value."""
-    counted = (labels != 0) & (labels != most_frequent)
-    pairs = counted[1:] & counted[:-1]
-    return bool(
-        np.count_nonzero(pairs & (labels[1:] == labels[:-1])) < _MIN_EQUAL * np.count_nonzero(pairs)
-    )
+    is_counted = (labels != 0) & (labels != most_frequent)
+    pairs = is_counted[1:] & is_counted[:-1]
+    is_equal = labels[1:] == labels[:-1]
+    n_equal = np.count_nonzero(pairs & is_equal)
+    return bool(n_equal < _MIN_EQUAL * np.count_nonzero(pairs))
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -422,19 +445,18 @@ def label_bodies(
 
 def _in_pieces(volume: LabelVolume) -> LabelVolume:
     """Give each connected component its own label, in the order of the voxels, without those too small for a body."""
-    label, _ = ndimage.label(volume.layers[0], np.ones((3, 3, 3)))
+    label, _ = ndimage.label(volume.layers[0], TOUCHING)
     is_speck = np.bincount(label.ravel(), minlength=2) < MIN_VOXELS
     is_speck[0] = False
     if is_speck[1:].all():  # keep them: their error says that they are too small
         is_speck[:] = False
-    names = {k: f"piece {i}" for i, k in enumerate((np.flatnonzero(~is_speck[1:]) + 1).tolist(), 1)}
-    notes = (f"left out {counted(int(is_speck.sum()), 'speck')}",) if is_speck.any() else ()
-    return replace(
-        volume,
-        layers=(np.where(is_speck[label], 0, label),),
-        names=names,
-        notes=(*volume.notes, *notes),
-    )
+    kept = np.flatnonzero(~is_speck)[1:]  # without the background
+    names = {piece: f"piece {number}" for number, piece in enumerate(kept.tolist(), 1)}
+    notes = volume.notes
+    if is_speck.any():
+        notes = (*notes, f"left out {counted(int(is_speck.sum()), 'speck')}")
+    layer = np.where(is_speck[label], 0, label)
+    return replace(volume, layers=(layer,), names=names, notes=notes)
 
 
 def _beside(path: Path, options: LoadOptions) -> list[Path]:
