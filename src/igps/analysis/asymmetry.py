@@ -59,15 +59,17 @@ def find_pairs(bodies: Bodies) -> list[Pair]:
     it names the structure, and the other parts of the path name the subject. If no part of a path is left, as for
     `1_left.ply` and `2_left.ply`, the structures are the subjects.
     """
-    places = [_place(name, part) for name, part in zip(bodies.names, bodies.parts, strict=True)]
-    sided: dict[str, dict[tuple[str, str], int]] = {"l": {}, "r": {}}
-    for i, place in enumerate(places):
+    lefts: dict[tuple[str, str], int] = {}
+    rights: dict[tuple[str, str], int] = {}
+    for i, (name, part) in enumerate(zip(bodies.names, bodies.parts, strict=True)):
+        place = _place(name, part)
         if place is not None:
             subject, structure, side = place
-            sided[side].setdefault((subject, structure), i)
+            own_side = lefts if side == "l" else rights
+            own_side.setdefault((subject, structure), i)
     pairs = []
-    for (subject, structure), left in sided["l"].items():
-        right = sided["r"].get((subject, structure))
+    for (subject, structure), left in lefts.items():
+        right = rights.get((subject, structure))
         if right is not None:
             pairs.append(Pair(subject or ".", structure or "all", left, right))
     subjects = {pair.subject for pair in pairs}
@@ -114,21 +116,24 @@ def asymmetries(
         volumes: (N,) of the bodies.
         is_cut: which of the N bodies the border of an image may have cut; their pairs have no scores.
     """
+    forms = []
     with torch.inference_mode():
-        forms = [
-            float(descriptor.distances(descriptions[[p.left]], descriptions[[p.right]]))
-            for p in pairs
-        ]
+        for pair in pairs:
+            one = descriptions[[pair.left]]
+            other = descriptions[[pair.right]]
+            forms.append(float(descriptor.distances(one, other)))
     left = volumes[[pair.left for pair in pairs]]
     right = volumes[[pair.right for pair in pairs]]
     sizes = 2 * (left - right) / (left + right)
     codes = codes_of([pair.structure for pair in pairs])
     n_per_subject = max_bodies_of_subject([pair.subject for pair in pairs], codes)
     cut = is_cut or [False] * len(volumes)
-    is_whole = np.array([not (cut[pair.left] or cut[pair.right]) for pair in pairs])
+    has_cut = [cut[pair.left] or cut[pair.right] for pair in pairs]
+    is_whole = ~np.array(has_cut, dtype=bool)
     n_whole = np.bincount(codes, weights=is_whole)
     is_scored = is_whole & (n_whole[codes] >= MIN_SUBJECTS)
-    logarithms = np.where(is_scored, np.log(np.maximum(forms, 1e-12)), np.nan)
+    logarithms = np.log(np.maximum(forms, 1e-12))
+    logarithms = np.where(is_scored, logarithms, np.nan)
     form_scores, _ = deviations_of(logarithms, codes, "shape", n_per_subject)
     known_sizes = np.where(is_scored, sizes, np.nan)
     size_scores, _ = deviations_of(known_sizes, codes, "volume", n_per_subject)
@@ -138,4 +143,8 @@ def asymmetries(
         if is_scored[i]:
             scores = [float(form_scores[i]), float(size_scores[i])]
         found.append(Asymmetry(pair, forms[i], float(sizes[i]), *scores))
-    return sorted(found, key=lambda one: -np.inf if one.score is None else one.score, reverse=True)
+
+    def unusualness(one: Asymmetry) -> float:
+        return -np.inf if one.score is None else one.score
+
+    return sorted(found, key=unusualness, reverse=True)

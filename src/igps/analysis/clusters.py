@@ -9,6 +9,7 @@ from scipy.spatial.distance import squareform
 
 from igps._arrays import Floats, Integers
 from igps._parameters import check_at_least, check_one_of
+from igps.analysis.groups import medoids_of
 from igps.analysis.map import checked_distances
 
 Linkage = Literal["average", "complete", "single"]
@@ -64,22 +65,19 @@ def clusters_of(
         raise ValueError(f"n_clusters: expected 1 to {n}, got {n_clusters}.")
     labels = _by_size(_cut(tree, n_clusters))
     n_found = int(labels.max()) + 1
-    medoids = []
-    for number in range(n_found):
-        own = np.flatnonzero(labels == number)
-        sums = square[np.ix_(own, own)].sum(axis=1)
-        medoids.append(int(own[sums.argmin()]))
     jaccard = np.full((n_resamples, n_found), np.nan)
     if n > max(3, 2 * n_found):  # half of three bodies cannot be clustered
         random = np.random.default_rng(seed)
         for row in jaccard:
             half = np.sort(random.choice(n, n // 2, replace=False))
-            resampled = _cut(_tree(square[np.ix_(half, half)], linkage), n_found)
+            tree_of_half = _tree(square[np.ix_(half, half)], linkage)
+            resampled = _cut(tree_of_half, n_found)
             row[:] = _jaccard(labels[half], resampled, n_found)
     n_halves = np.isfinite(jaccard).sum(axis=0)
-    sums = np.nansum(jaccard, axis=0)
-    stability = np.where(n_halves, sums / np.maximum(n_halves, 1), np.nan)
-    return Clusters(labels, tuple(medoids), tuple(stability.tolist()), tree)
+    means = np.nansum(jaccard, axis=0) / np.maximum(n_halves, 1)
+    stability = np.where(n_halves, means, np.nan)
+    medoids = tuple(medoids_of(square, labels))
+    return Clusters(labels, medoids, tuple(stability.tolist()), tree)
 
 
 def _best_number(distances: Floats, tree: Floats) -> int:
@@ -118,7 +116,8 @@ def _jaccard(original: Integers, resampled: Integers, n_clusters: int) -> Floats
     n_resampled = resampled_sets.sum(axis=0)
     intersection = original_sets.T @ resampled_sets
     union = n_drawn[:, None] + n_resampled - intersection
-    largest = (intersection / np.maximum(union, 1)).max(axis=1)
+    indices = intersection / np.maximum(union, 1)
+    largest = indices.max(axis=1)
     return np.where(n_drawn > 1, largest, np.nan)
 
 

@@ -165,6 +165,16 @@ def codes_of(names: Sequence[str]) -> Integers:
     return codes
 
 
+def medoids_of(distances: Floats, codes: Integers) -> list[int]:
+    """Return the body of each group that has the smallest sum of distances (N, N) to the others of the group."""
+    medoids = []
+    for code in range(int(codes.max()) + 1):
+        own = np.flatnonzero(codes == code)
+        sums = distances[np.ix_(own, own)].sum(axis=1)
+        medoids.append(int(own[sums.argmin()]))
+    return medoids
+
+
 def _check_numbers_of_bodies(n: int, **values: Sized) -> None:
     for name, value in values.items():
         if len(value) != n:
@@ -357,7 +367,8 @@ def permutations(stratum: Integers, count: int, random: np.random.Generator) -> 
     orders = np.empty((count, len(stratum)), dtype=np.int64)
     for code in range(stratum.max() + 1):
         members = np.flatnonzero(stratum == code)
-        orders[:, members] = random.permuted(np.tile(members, (count, 1)), axis=1)
+        copies = np.tile(members, (count, 1))
+        orders[:, members] = random.permuted(copies, axis=1)
     return orders
 
 

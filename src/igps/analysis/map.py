@@ -32,7 +32,8 @@ class BodyMap:
 def checked_distances(distances: Floats) -> Floats:
     """Return symmetric distances (N, N) with a zero diagonal; raise a ValueError for another shape, N < 3, or NaN."""
     square = np.asarray(distances, dtype=float)
-    if square.ndim != 2 or len(square) != square.shape[-1] or len(square) < 3:
+    n = len(square)
+    if square.shape != (n, n) or n < 3:
         raise ValueError(
             f"distances: expected (N, N) between three bodies or more, got {square.shape}."
         )
@@ -66,8 +67,10 @@ def body_map(distances: Floats, layout: Layout = "mds", *, seed: int = 0) -> Bod
     square = checked_distances(distances)
     points = _metric_mds(square) if layout == "mds" else _umap(square, seed)
     centred = points - points.mean(axis=0)
-    rotated = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
-    rotated *= np.where((rotated**3).sum(axis=0) < 0, -1, 1)
+    _, _, axes = np.linalg.svd(centred, full_matrices=False)
+    rotated = centred @ axes.T
+    skewness = (rotated**3).sum(axis=0)
+    rotated *= np.where(skewness < 0, -1, 1)
     return BodyMap(rotated, _stress(square, rotated))
 
 
@@ -79,8 +82,9 @@ def ends_of_axis(distances: Floats, axis: int) -> tuple[tuple[int, int], float]:
         axis: 1 or 2, see `body_map`.
     """
     along = body_map(distances).points[:, axis - 1]
+    mean_square = np.square(checked_distances(distances)).mean()
     # The mean square of a distance is twice the variance
-    share = 2 * float(along.var() / np.square(checked_distances(distances)).mean())
+    share = 2 * float(along.var() / mean_square)
     return (int(along.argmin()), int(along.argmax())), share
 
 
@@ -104,7 +108,8 @@ def _classical_mds(distances: Floats) -> Floats:
     if n < 500 or not products.any():
         values, axes = eigh(products, subset_by_index=(n - 2, n - 1))
     else:
-        values, axes = eigsh(products, 2, which="LA", v0=np.sin(np.arange(n) + 1.0))
+        start = np.sin(np.arange(n) + 1.0)
+        values, axes = eigsh(products, 2, which="LA", v0=start)
     return axes * np.sqrt(np.maximum(values, 0))
 
 
@@ -136,6 +141,7 @@ def _stress(distances: Floats, points: Floats) -> float:
     mapped = pdist(points)
     if not expected.any():
         return 0.0
-    mapped = mapped * ((expected @ mapped) / max(float(mapped @ mapped), 1e-300))
+    scale = (expected @ mapped) / max(float(mapped @ mapped), 1e-300)
+    mapped = mapped * scale
     errors = np.square(expected - mapped).sum()
     return float(np.sqrt(errors / np.square(expected).sum()))

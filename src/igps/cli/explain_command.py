@@ -212,10 +212,8 @@ def _explain_pair(result: Described, pair: list[int], descriptor: str) -> _Expla
 
 def _explain_groups(folder: Folder, descriptor: str, level: float, **describing: Any) -> _Explained:
     """Explain the medoids of two groups, but paint the mean difference, on the body nearest to the mean."""
-    import numpy as np
-
     from igps.analysis.dissimilarity import REQUIREMENTS
-    from igps.analysis.groups import squared_distances
+    from igps.analysis.groups import codes_of, medoids_of, squared_distances
     from igps.cli.places import places_of_groups
     from igps.cli.reading import described
     from igps.descriptors.size_and_side import SIZE
@@ -226,12 +224,7 @@ def _explain_groups(folder: Folder, descriptor: str, level: float, **describing:
     labels: Any = folder.check(dataset.bodies)  # without the bodies that could not be used
     _print_kinds(dataset, folder.body)
     coordinates = result.coordinates()
-    squares = squared_distances(coordinates)
-    medoids = []
-    for name in sorted(set(labels)):
-        own = np.flatnonzero(labels == name)
-        sums = squares[np.ix_(own, own)].sum(axis=1)
-        medoids.append(int(own[sums.argmin()]))
+    medoids = medoids_of(squared_distances(coordinates), codes_of(labels))
     found = _explain_pair(result, medoids, descriptor)
     places = places_of_groups(
         dataset,

@@ -64,9 +64,8 @@ class FileAttribute(ABC):
         except MeshError as error:
             if str(body) in str(error):
                 raise
-            raise MeshError(
-                f"{body}: its attribute file {error}"
-            ) from error  # the body may be one of thousands
+            # The body may be one of thousands
+            raise MeshError(f"{body}: its attribute file {error}") from error
         except Exception as error:  # the readers of the formats raise exceptions of many types
             raise MeshError(
                 f"{body}: its attribute file {file} is not readable ({type(error).__name__}: "
@@ -87,7 +86,8 @@ class FileAttribute(ABC):
         files = set()
         for path in paths:
             with contextlib.suppress(MeshError):
-                if (file := self.file(BodyRef(path))[0]) != path:
+                file, _ = self.file(BodyRef(path))
+                if file != path:
                     files.add(file)
         return files
 
@@ -100,14 +100,14 @@ class FileAttribute(ABC):
             (Path(os.path.abspath(body.path)), Path(os.path.abspath(root))),
             (body.path.parent.resolve() / body.path.name, root.resolve()),
         )
-        relative = (
-            file.relative_to(folder) for file, folder in locations if file.is_relative_to(folder)
-        )
-        below_root = next(relative, Path(body.path.name)).as_posix()
+        below_root = body.path.name
+        for file, folder in locations:
+            if file.is_relative_to(folder):
+                below_root = file.relative_to(folder).as_posix()
+                break
         if Path(pattern).is_absolute():
-            root = (
-                Path(pattern.partition("{")[0]).parent if "{" in pattern else Path(pattern).parent
-            )
+            fixed, _, _ = pattern.partition("{")
+            root = Path(fixed).parent
         values = {
             "{stem}": body.path.name.partition(".")[0],
             "{file}": below_root,
@@ -201,9 +201,8 @@ def fill_missing(values: Floats, points: Floats, label: str) -> Floats:
     known = np.asarray(is_known(values.reshape(len(points), -1)).all(axis=1))
     n_missing = int((~known).sum())
     if n_missing > _MAX_MISSING_SHARE * len(known):
-        low, high = (
-            ", ".join(f"{x:.4g}" for x in end) for end in (points.min(axis=0), points.max(axis=0))
-        )
+        low = ", ".join(f"{x:.4g}" for x in points.min(axis=0))
+        high = ", ".join(f"{x:.4g}" for x in points.max(axis=0))
         raise MeshError(
             f"{label}: has no value at {n_missing} of {len(known)} points of the body, which extends from ({low}) to "
             f"({high}); at most {_MAX_MISSING_SHARE:.0%} of the points may lack a value. Give values of this body, in "
@@ -213,7 +212,7 @@ def fill_missing(values: Floats, points: Floats, label: str) -> Floats:
         logger.warning(
             "%s: %d of %d values were taken from the nearest point", label, n_missing, len(known)
         )
-        nearest = cKDTree(points[known]).query(points[~known])[1]
+        _, nearest = cKDTree(points[known]).query(points[~known])
         values = values.copy()
         values[~known] = values[known][nearest]
     return values

@@ -210,7 +210,9 @@ class SignatureBatch:
         def convert(values: Tensor) -> Tensor:
             return values.to(device) if values.is_floating_point() else values
 
-        return replace(self, interior=self.interior.map(convert), surface=self.surface.map(convert))
+        interior = self.interior.map(convert)
+        surface = self.surface.map(convert)
+        return replace(self, interior=interior, surface=surface)
 
     def pin_memory(self) -> SignatureBatch:
         """Return the batch in pinned memory; `DataLoader(pin_memory=True)` calls this method."""
@@ -227,6 +229,9 @@ class SignatureBatch:
                 "batches: expected meshes in all batches or in none, got some of each."
             )
         measures = [batch.measures for batch in batches if batch.measures is not None]
+        units: list[str | None] = []
+        for batch in batches:
+            units += batch.units or [None] * len(batch)
         return SignatureBatch(
             eigenvalues=_joined([batch.eigenvalues for batch in batches], math.inf),
             interior=_joined_samples([batch.interior for batch in batches]),
@@ -236,7 +241,7 @@ class SignatureBatch:
             labels=torch.cat([batch.labels for batch in batches]),
             ids=tuple(name for batch in batches for name in batch.ids),
             meshes=tuple(itertools.chain(*meshes)) if meshes else None,
-            units=tuple(unit for batch in batches for unit in batch.units or (None,) * len(batch)),
+            units=tuple(units),
             measures=torch.cat(measures) if len(measures) == len(batches) else None,
         )
 
@@ -284,7 +289,8 @@ def _empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
     # NumPy requests huge pages, which the system provides many times faster than those that PyTorch gets: new memory
     # took a quarter of the time of an epoch.
     n_bytes = math.prod(shape) * like.element_size()
-    return torch.from_numpy(np.empty(n_bytes, np.uint8)).view(like.dtype).view(shape)
+    memory = torch.from_numpy(np.empty(n_bytes, np.uint8))
+    return memory.view(like.dtype).view(shape)
 
 
 def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:

@@ -47,12 +47,9 @@ class Failure:
     def of(bodies: Bodies, i: int, reason: str, summary: str = "") -> Failure:
         """Return the failure of a body by its index, with its file named in the error."""
         path = bodies.paths[i]
-        return Failure(
-            bodies.names[i],
-            path,
-            reason if reason.startswith(str(path)) else f"{bodies[i]}: {reason}",
-            summary,
-        )
+        if not reason.startswith(str(path)):
+            reason = f"{bodies[i]}: {reason}"
+        return Failure(bodies.names[i], path, reason, summary)
 
 
 def left_out(summaries: Iterable[str]) -> str:
@@ -205,8 +202,8 @@ def group_by_file(
     for i in indices:
         groups.setdefault(bodies.paths[i], []).append(i)
     step = max_size or len(bodies)
-    return [
-        group[start : start + step]
-        for group in groups.values()
-        for start in range(0, len(group), step)
-    ]
+    parts = []
+    for group in groups.values():
+        for start in range(0, len(group), step):
+            parts.append(group[start : start + step])
+    return parts

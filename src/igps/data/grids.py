@@ -29,7 +29,8 @@ class Grid:
 
     def to_voxels(self, points: Floats) -> Floats:
         """Return the indices (P, 3), not rounded, of points (P, 3) of the world."""
-        return (points - self.affine[:3, 3]) @ np.linalg.inv(self.affine[:3, :3]).T
+        to_indices = np.linalg.inv(self.affine[:3, :3])
+        return (points - self.affine[:3, 3]) @ to_indices.T
 
     def to_world(self, indices: Floats) -> Floats:
         """Return the points (P, 3) of the world at indices (P, 3)."""
@@ -39,21 +40,25 @@ class Grid:
         """Return values (P,) at points (P, 3), interpolated linearly; NaN more than half a voxel outside."""
         indices = self.to_voxels(points)
         size = np.array(self.values.shape)
-        inside = ((indices > -0.5) & (indices < size - 0.5)).all(axis=1)
+        is_within = (indices > -0.5) & (indices < size - 0.5)
+        inside = is_within.all(axis=1)
         found = np.full(len(points), np.nan)
         if not inside.any():
             return found
+        indices = indices[inside]
         # A large image is converted only where it is needed
-        low = np.clip(np.floor(indices[inside].min(axis=0)).astype(int), 0, size - 1)
-        high = np.clip(np.ceil(indices[inside].max(axis=0)).astype(int), 0, size - 1)
+        low = np.floor(indices.min(axis=0)).astype(int)
+        high = np.ceil(indices.max(axis=0)).astype(int)
+        low = np.clip(low, 0, size - 1)
+        high = np.clip(high, 0, size - 1)
         block = self.values[tuple(map(slice, low, high + 1))].astype(np.float64)
         known = is_known(block)
-        interpolate = partial(
-            map_coordinates, coordinates=(indices[inside] - low).T, order=1, mode="nearest"
-        )
+        places = (indices - low).T
+        interpolate = partial(map_coordinates, coordinates=places, order=1, mode="nearest")
         weight = interpolate(known.astype(np.float64))
         sums = interpolate(np.where(known, block, 0.0))
-        found[inside] = np.where(weight > 0.5, sums / np.maximum(weight, 0.5), np.nan)
+        means = sums / np.maximum(weight, 0.5)
+        found[inside] = np.where(weight > 0.5, means, np.nan)
         return found
 
 

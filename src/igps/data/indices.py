@@ -15,25 +15,21 @@ Indices = slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDAr
 
 def scalar_index(index: Any) -> Any:
     """Convert an array without dimensions, such as an element of a permutation, to an integer; return others as is."""
-    return (
-        operator.index(index)
-        if isinstance(index, Tensor | np.ndarray) and index.ndim == 0
-        else index
-    )
+    if isinstance(index, Tensor | np.ndarray) and index.ndim == 0:
+        return operator.index(index)
+    return index
 
 
 def resolve_indices(index: Indices, n: int) -> list[int]:
     """Return the indices of n items that a slice, integers, or a mask select; raise an IndexError if out of range."""
     if isinstance(index, slice):
         return list(range(n))[index]
-    array = (
-        index.cpu()
-        if isinstance(index, Tensor)
-        else torch.as_tensor(np.asarray(index), device="cpu")
-    )
+    if isinstance(index, Tensor):
+        index = index.cpu().numpy()
+    array = torch.as_tensor(np.asarray(index), device="cpu")
     if array.dtype == torch.bool and array.shape != (n,):
         raise IndexError(f"mask: expected {n} entries, got an array of shape {tuple(array.shape)}.")
-    indices: list[int] = torch.arange(n, device="cpu")[
-        array if array.numel() else array.long()
-    ].tolist()
+    if not array.numel():
+        return []
+    indices: list[int] = torch.arange(n, device="cpu")[array].tolist()
     return indices

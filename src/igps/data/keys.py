@@ -61,10 +61,11 @@ def signature_key(
     name = body.path.name.lower()
     suffix = ".pqr.gz" if name.endswith(".pqr.gz") else Path(name).suffix
     if body.number is None:
-        return _hash(_parameters(suffix, body.part, None, reading, config) + content.digest).hex()
+        parameters = _parameters(suffix, body.part, None, reading, config)
+        return _hash(parameters + content.digest).hex()
     # Whatever the body is called: other names of labels compute nothing anew
-    digest = content.nameless or content.digest
-    return _hash(_parameters(suffix, None, body.number, reading, config) + digest).hex()
+    parameters = _parameters(suffix, None, body.number, reading, config)
+    return _hash(parameters + (content.nameless or content.digest)).hex()
 
 
 def derived_key(kind: str, key: str, *parameters: object) -> str:

@@ -55,9 +55,8 @@ class Requirements:
         config = config.with_eigenpairs(max(default, self.n_eigenpairs))
         self._check_eigenpairs(config.n_kept)
         attributes = dict.fromkeys((*config.attributes, *self.attributes))
-        return replace(
-            config, attributes=tuple(attributes), measures=config.measures or self.measures
-        )
+        measures = config.measures or self.measures
+        return replace(config, attributes=tuple(attributes), measures=measures)
 
     def check_config(self, config: SignatureConfig) -> None:
         """Raise a ValueError if Signatures of a configuration do not meet the requirements."""
@@ -77,7 +76,8 @@ class Requirements:
         # Neither in tracing nor on the device "meta" are there values to read
         has_values = not torch.compiler.is_compiling() and batch.device.type != "meta"
         if self.n_eigenpairs and has_values:
-            self._check_eigenpairs(int(torch.isfinite(batch.eigenvalues).sum(dim=1).min()))
+            n_present = torch.isfinite(batch.eigenvalues).sum(dim=1)
+            self._check_eigenpairs(int(n_present.min()))
         self._check_attributes({*batch.interior.attributes, *batch.surface.attributes})
         if self.mesh and batch.meshes is None:
             raise ValueError(
@@ -86,7 +86,8 @@ class Requirements:
             )
 
     def _check_attributes(self, names: Collection[str]) -> None:
-        if missing := [name for name in (*self.attributes, *self.sources) if name not in names]:
+        missing = [name for name in (*self.attributes, *self.sources) if name not in names]
+        if missing:
             raise ValueError(
                 f"attributes: this descriptor needs signatures with {', '.join(missing)}, got {sorted(names)}. Compute "
                 "them with SignatureDataset(..., descriptor=...), or with SignatureConfig(attributes=...)."
@@ -100,14 +101,16 @@ class Requirements:
             )
 
 
+SURFACE_DIRECTION = Requirements(attributes=("surface_direction",))
+"""That each sample has its direction to the surface, or out of it."""
+
+
 def embedding_requirements(embedding: nn.Module) -> Requirements:
     """Return the requirements of an embedding: its `n_eigenpairs`, or the whole spectrum if it has none."""
     n_eigenpairs = getattr(embedding, "n_eigenpairs", None)
-    return (
-        Requirements(n_eigenpairs)
-        if isinstance(n_eigenpairs, int)
-        else Requirements(whole_spectrum=True)
-    )
+    if isinstance(n_eigenpairs, int):
+        return Requirements(n_eigenpairs)
+    return Requirements(whole_spectrum=True)
 
 
 class HasRequirements(Protocol):

@@ -50,7 +50,8 @@ class BucketBatchSampler(Sampler[list[int]]):
         batches: list[list[int]] = []
         for bucket in order.split(_BATCHES_PER_BUCKET * self.batch_size):
             # A stable sort keeps shapes of equal size in their random order
-            by_size = bucket[torch.sort(self.sizes[bucket], stable=True).indices]
+            ranked = torch.sort(self.sizes[bucket], stable=True).indices
+            by_size = bucket[ranked]
             batches += [batch.tolist() for batch in by_size.split(self.batch_size) if len(batch)]
         for i in torch.randperm(len(batches), generator=self.generator).tolist():
             yield batches[i]

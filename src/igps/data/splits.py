@@ -82,11 +82,12 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
                 f"n_train: expected fewer than the {len(members)} shapes of class {label}, got {n_train}."
             )
         n_held_out = _count(n_validation, n_fit, 2)
-        shuffled = members[torch.randperm(len(members), generator=generator)].tolist()
+        order = torch.randperm(len(members), generator=generator)
+        shuffled = members[order].tolist()
         train += shuffled[n_held_out:n_fit]
         validation += shuffled[:n_held_out]
         test += shuffled[n_fit:]
-    return Split(*(tuple(sorted(part)) for part in (train, validation, test)))
+    return Split(tuple(sorted(train)), tuple(sorted(validation)), tuple(sorted(test)))
 
 
 def split_unseen(
@@ -110,7 +111,8 @@ def split_unseen(
     n_held_out = _count(n_validation, n_fit, 1)
     if n_fit >= len(classes):
         raise ValueError(f"n_train: expected fewer than the {len(classes)} classes, got {n_train}.")
-    shuffled = classes[torch.randperm(len(classes), generator=torch.Generator().manual_seed(seed))]
+    generator = torch.Generator().manual_seed(seed)
+    shuffled = classes[torch.randperm(len(classes), generator=generator)]
 
     def members(chosen: Tensor) -> tuple[int, ...]:
         return tuple(torch.nonzero(torch.isin(labels, chosen)).flatten().tolist())
@@ -124,7 +126,10 @@ def split_unseen(
 
 def _count(amount: float, n: int, min_count: int, min_left: int = 1) -> int:
     """Return a whole number unchanged, or a share of n as a number of at least `min_count` that leaves `min_left`."""
-    return min(max(round(amount * n), min_count), n - min_left) if 0 < amount < 1 else int(amount)
+    if not 0 < amount < 1:
+        return int(amount)
+    count = max(round(amount * n), min_count)
+    return min(count, n - min_left)
 
 
 def _check(n_validation: float, n_train: float) -> None:

@@ -15,8 +15,9 @@ def known_surface(cache: Cache, key: str, part: str | None) -> RawBody | None:
     def decode(record: Record) -> RawBody:
         fields: dict[str, Any] = {name: json.loads(record.texts[name]) for name in _FIELDS}
         fields["notes"] = tuple(fields["notes"])
-        arrays = record.arrays
-        return RawBody(arrays["vertices"], arrays["faces"], part, denoise=False, **fields)
+        vertices = record.arrays["vertices"]
+        faces = record.arrays["faces"]
+        return RawBody(vertices, faces, part, denoise=False, **fields)
 
     return cache.get(key, decode)
 

@@ -30,7 +30,8 @@ def fingerprint(descriptor: nn.Module) -> str:
     # Attributes of every module; they differ between versions of PyTorch
     common = vars(nn.Module())
     for name, module in descriptor.named_modules():
-        plain = {k: v for k, v in sorted(vars(module).items()) if k not in common and _is_plain(v)}
+        own = {key: value for key, value in sorted(vars(module).items()) if key not in common}
+        plain = {key: value for key, value in own.items() if _is_plain(value)}
         checksum.update(f"{name} {type(module).__qualname__} {plain!r}\0".encode())
     for name, tensor in sorted(descriptor.state_dict().items()):
         values = tensor.detach().cpu().contiguous()
@@ -46,15 +47,15 @@ def cache_tag(module: nn.Module) -> str | None:
     of the versions of the numerical packages. It is None for a descriptor with code from outside the library, such as a
     forward hook or a module of another package.
     """
-    if any(
-        submodule._forward_hooks or submodule._forward_pre_hooks for submodule in module.modules()
-    ):
-        return None
+    for submodule in module.modules():
+        if submodule._forward_hooks or submodule._forward_pre_hooks:
+            return None
     try:
         spec = json.dumps(specification(module))
     except ValueError:
         return None
-    return f"{hashlib.sha256(spec.encode()).hexdigest()[:32]} {fingerprint(module)} {_code_tag()}"
+    checksum = hashlib.sha256(spec.encode()).hexdigest()[:32]
+    return f"{checksum} {fingerprint(module)} {_code_tag()}"
 
 
 @cache

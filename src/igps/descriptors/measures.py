@@ -94,7 +94,8 @@ class Measures(Descriptor):
         if bool(self.fitted) or len(measures) < 2 or not all(measures):
             return False
         rows = [[row.get(name, math.nan) for name in POWERS] for row in measures]
-        spread = self.logarithms(torch.tensor(rows, dtype=torch.float64), units).std(dim=0)
+        columns = self.logarithms(torch.tensor(rows, dtype=torch.float64), units)
+        spread = columns.std(dim=0)
         self.spread.copy_(torch.where(spread > _MIN_SPREAD, spread, self.spread))
         self.fitted.fill_(True)
         return True

@@ -201,7 +201,8 @@ def signed_volumes(batch: SignatureBatch) -> Tensor:
     interior, interior_weights = _centred(batch.interior, root)
     surface, surface_weights = _centred(batch.surface, root)
     moments = (interior * interior_weights).mT @ interior
-    moments = moments / moments.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None]
+    traces = moments.diagonal(dim1=1, dim2=2).sum(dim=1)
+    moments = moments / traces[:, None, None]
     k = min(_N_HEAT_EIGENPAIRS, batch.eigenvalues.shape[1])
     eigenvalues = batch.eigenvalues[:, None, :k] * batch.area[:, None, None]
     times = root.new_tensor(_TIMES)
@@ -209,7 +210,8 @@ def signed_volumes(batch: SignatureBatch) -> Tensor:
     eigenfunctions = batch.surface.eigenfunctions[..., :k].to(root)
     heat = eigenfunctions.square() @ decay.mT
     heat = heat / (heat * surface_weights).sum(dim=1, keepdim=True)
-    functions = torch.cat([surface.norm(dim=2, keepdim=True), heat], dim=2)
+    distances = surface.norm(dim=2, keepdim=True)
+    functions = torch.cat([distances, heat], dim=2)
     on_surface = (functions * surface_weights).mT @ surface
     depths = interior.norm(dim=2, keepdim=True)
     inside = (depths * interior_weights).mT @ interior
@@ -233,10 +235,11 @@ def _centred(samples: SampleBatch, root: Tensor) -> tuple[Tensor, Tensor]:
 def _log_sizes(batch: SignatureBatch) -> Tensor:
     """(N, 2) log area and log volume, in millimetres where the unit is known."""
     units = batch.units or [None] * len(batch)
-    size = torch.stack([batch.area.log(), batch.volume.log()], dim=1)
-    factors = [millimetres(unit) for unit in units]
-    shifts = torch.tensor(factors, dtype=size.dtype, device=size.device).log()
-    return size + shifts[:, None] * shifts.new_tensor([2.0, 3.0])
+    factors = batch.area.new_tensor([millimetres(unit) for unit in units])
+    shifts = factors.log()
+    log_area = batch.area.log() + shifts * 2
+    log_volume = batch.volume.log() + shifts * 3
+    return torch.stack([log_area, log_volume], dim=1)
 
 
 def form_of(descriptor: Descriptor) -> Descriptor:

@@ -63,7 +63,8 @@ class WithNumbers(Descriptor):
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, cells + 12 + 1) descriptions."""
-        return torch.cat([self.descriptor(batch).flatten(1), self.numbers(batch)], dim=1)
+        form = self.descriptor(batch).flatten(1)
+        return torch.cat([form, self.numbers(batch)], dim=1)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) Euclidean distances; a head has a better one."""

@@ -43,7 +43,8 @@ class SampleFeatures:
     def positions(self) -> Tensor:
         """Return the positions (N, P, 3) of the samples in units of √area."""
         points = _at_least_single(self.samples.points)
-        return points / self.batch.area.sqrt().to(points.dtype)[:, None, None]
+        unit = self.batch.area.sqrt().to(points.dtype)
+        return points / unit[:, None, None]
 
     def attribute(self, name: str) -> Tensor:
         """Return an attribute (N, P) or (N, P, 3) of the samples; raise a ValueError if it is missing."""
@@ -137,7 +138,8 @@ def nearest_directions(
         distances = torch.cdist(points.detach(), real)
     nearest, indices = smallest(distances, min(n_nearest, mask.shape[-1]))
     is_real = (nearest < _FAR_AWAY).unsqueeze(-1)
-    rows = indices.flatten(-2).unsqueeze(-1).expand(*indices.shape[:-2], -1, points.shape[-1])
+    rows = indices.flatten(-2).unsqueeze(-1)
+    rows = rows.expand(*rows.shape[:-1], points.shape[-1])
     neighbours = targets.gather(-2, rows).unflatten(-2, indices.shape[-2:])
     sums = torch.where(is_real, neighbours, 0).sum(dim=-2)
     mean = sums / is_real.sum(dim=-2)

@@ -42,6 +42,7 @@ class Classifier(nn.Module):
         return on_one_thread(self._logits, batch, self)
 
     def _logits(self, batch: SignatureBatch) -> Tensor:
-        cells = self.descriptor(batch).flatten(1).to(next(self.layers.parameters()).dtype)
+        dtype = next(self.layers.parameters()).dtype
+        cells = self.descriptor(batch).flatten(1).to(dtype)
         logits: Tensor = self.layers(square_root(cells))
         return logits

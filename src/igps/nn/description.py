@@ -78,9 +78,8 @@ def describe(
     """
     dataset = _with_required(dataset, descriptor, n_workers)
     if not isinstance(descriptor, nn.Module):
-        remedy = (
-            f"igps.descriptor({descriptor!r})" if isinstance(descriptor, str) else "a Descriptor"
-        )
+        is_name = isinstance(descriptor, str)
+        remedy = f"igps.descriptor({descriptor!r})" if is_name else "a Descriptor"
         raise TypeError(f"descriptor: expected a module, got {descriptor!r}. Give {remedy}.")
     if not len(dataset):
         raise ValueError("dataset: expected at least one mesh to describe, got none.")
@@ -93,13 +92,9 @@ def describe(
     else:
         chunks = [missing[i : i + batch_size] for i in range(0, len(missing), batch_size)]
         results = _on_threads(dataset, descriptor, chunks, n_workers)
-    with (
-        evaluation_mode(descriptor),
-        Progress(
-            desc="descriptions", total=len(dataset), initial=len(descriptions), disable=not progress
-        ) as bar,
-        contextlib.closing(results),
-    ):
+    n_known = len(descriptions)
+    bar = Progress(desc="descriptions", total=len(dataset), initial=n_known, disable=not progress)
+    with evaluation_mode(descriptor), bar, contextlib.closing(results):
         for indices, outcomes in results:
             bar.update(len(indices))
             for i, outcome in zip(indices, outcomes, strict=True):
@@ -115,7 +110,8 @@ def describe(
         failures += [failed[i] for i in sorted(failed)]
     if not descriptions:
         raise MeshError(failed[0].error)
-    return torch.from_numpy(np.stack([descriptions[i] for i in sorted(descriptions)]))
+    rows = np.stack([descriptions[i] for i in sorted(descriptions)])
+    return torch.from_numpy(rows)
 
 
 def _with_required(
@@ -135,14 +131,14 @@ def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
     body contributes its first 500 interior samples. Raises a ValueError if a body does not have the attribute of an
     axis.
     """
-    axes = [
-        axis for axis in descriptor.modules() if isinstance(axis, Attribute) and not axis.is_fitted
-    ]
+    attribute_axes = [axis for axis in descriptor.modules() if isinstance(axis, Attribute)]
+    axes = [axis for axis in attribute_axes if not axis.is_fitted]
     values: list[list[Singles]] = [[] for _ in axes]
     for signature in dataset.signatures() if axes else ():
-        check_attributes(descriptor, signature.interior.attributes)
+        attributes = signature.interior.attributes
+        check_attributes(descriptor, attributes)
         for axis, samples in zip(axes, values, strict=True):
-            samples.append(signature.interior.attributes[axis.name][:500])
+            samples.append(attributes[axis.name][:500])
     for axis, samples in zip(axes, values, strict=True):
         axis.fit(torch.from_numpy(np.concatenate(samples)))
     is_fitted = False
@@ -190,11 +186,13 @@ def _on_threads(
     n_workers: int | None,
 ) -> _Outcomes:
     """Yield chunks of indices and the outcomes of their meshes, from several threads; on a GPU, from one."""
-    device = next(descriptor.parameters(), next(descriptor.buffers(), torch.empty(0))).device
+    tensors = [*descriptor.parameters(), *descriptor.buffers()]
+    device = tensors[0].device if tensors else torch.device("cpu")
 
     def outcomes(indices: Sequence[int]) -> Sequence[Singles | Failure]:
         try:
-            return list(describe_timed((descriptor, dataset.subset(indices), device))[0])
+            descriptions, _ = describe_timed((descriptor, dataset.subset(indices), device))
+            return list(descriptions)
         except ValueError as error:
             if len(indices) == 1:
                 return [Failure.of(dataset.bodies, indices[0], str(error))]
@@ -211,12 +209,11 @@ def _on_processes(
     jobs = [(descriptor, dataset.subset([i]), torch.device("cpu")) for i in indices]
     for number, result in run(describe_timed, jobs, n_workers=n_workers):
         i = indices[number]
-        outcome = (
-            Failure.of(dataset.bodies, i, result.reason)
-            if isinstance(result, Failed)
-            else result[0][0]
-        )
-        yield [i], [outcome]
+        if isinstance(result, Failed):
+            yield [i], [Failure.of(dataset.bodies, i, result.reason)]
+        else:
+            descriptions, _ = result
+            yield [i], list(descriptions)
 
 
 def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tuple[Singles, float]:
@@ -229,10 +226,12 @@ def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tup
         requirements = Requirements()
         if isinstance(descriptor, Descriptor):
             requirements = descriptor.requirements
-        batch = collate([replace(item, batched=requirements.samples) for item in dataset])
+        items = [replace(item, batched=requirements.samples) for item in dataset]
+        batch = collate(items)
         start = time.process_time()
         if requirements.mesh:
-            batch = replace(batch, meshes=tuple(dataset.mesh(i) for i in range(len(dataset))))
+            meshes = tuple(dataset.mesh(i) for i in range(len(dataset)))
+            batch = replace(batch, meshes=meshes)
         values: Singles = descriptor(batch.to(device)).cpu().numpy()
         seconds = time.process_time() - start
     if not np.isfinite(values).all():
@@ -254,17 +253,21 @@ class _DescriptionStore:
 
     def read(self) -> dict[int, Singles]:
         """Return the cached descriptions by the index of the mesh."""
-        values = {
-            i: self._cache.get(self._key(key), lambda record: record.arrays["values"])
-            for i, key in enumerate(self._keys)
-            if key is not None
-        }
-        return {i: x for i, x in values.items() if x is not None}
+        found = {}
+        for i, key in enumerate(self._keys):
+            if key is None:
+                continue
+            values = self._cache.get(self._key(key), lambda record: record.arrays["values"])
+            if values is not None:
+                found[i] = values
+        return found
 
     def write(self, i: int, values: Singles) -> None:
         """Cache the description of mesh i, unless its file changed since the dataset was read."""
         key = self._keys[i]
-        if key is None or not self._is_writable or self._dataset.subset([i]).cached_keys() != [key]:
+        if key is None or not self._is_writable:
+            return
+        if self._dataset.subset([i]).cached_keys() != [key]:
             return
         try:
             self._cache.put(self._key(key), Record({"values": values}))

@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
-from itertools import accumulate
 from operator import or_
 from pathlib import Path
 from types import MappingProxyType
@@ -100,8 +99,9 @@ class Descriptor(Specified, ABC):
         config = self.requirements.apply_to(
             SignatureConfig(n_surface_samples=100, resolution=10, min_samples=0)
         )
+        batch = collate([compute_signature(mesh, config)], [mesh])
         with torch.no_grad():
-            return self(collate([compute_signature(mesh, config)], [mesh]))[0].numel()
+            return self(batch)[0].numel()
 
     def save(self, path: str | Path, card: Mapping[str, Any] | None = None) -> None:
         """Save the descriptor as a safetensors file or a folder, for `igps.load` and all `--descriptor` options.
@@ -140,7 +140,8 @@ class Descriptor(Specified, ABC):
             _check_finite(self)
         self.requirements.check(batch)
         # On other devices, a limit on threads has no advantage; traced code runs later, without the limit.
-        with one_thread() if batches.uses_loops(batch.device) else contextlib.nullcontext():
+        has_limit = batches.uses_loops(batch.device)
+        with one_thread() if has_limit else contextlib.nullcontext():
             return self.describe(batch)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
@@ -213,10 +214,8 @@ class BodyDescriptor(Descriptor):
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """Return descriptions (N, ...) on the device of the batch."""
-        descriptions = [
-            np.asarray(self.describe_body(body), dtype=np.float32) for body in batch.bodies()
-        ]
-        return torch.from_numpy(np.stack(descriptions)).to(batch.device)
+        descriptions = np.stack([self.describe_body(body) for body in batch.bodies()])
+        return torch.from_numpy(descriptions.astype(np.float32)).to(batch.device)
 
 
 class HistogramDescriptor(Descriptor):
@@ -258,26 +257,24 @@ class HistogramDescriptor(Descriptor):
         if not groups or not all(groups):
             raise ValueError("histograms: expected at least one in each part, got none.")
         self.shares = [1.0] * len(groups) if shares is None else list(shares)
-        if len(self.shares) != len(groups) or not all(0 < x < math.inf for x in self.shares):
+        is_positive = all(0 < share < math.inf for share in self.shares)
+        if len(self.shares) != len(groups) or not is_positive:
             raise ValueError(
                 f"shares: expected a positive number for each of {len(groups)} parts, got {self.shares}."
             )
-        self.histograms = nn.ModuleList(histogram for group in groups for histogram in group)
+        flat = [histogram for group in groups for histogram in group]
+        self.histograms = nn.ModuleList(flat)
         # Histograms in each part; None for a single histogram, whose descriptions keep its shape.
-        self._sizes = (
-            None
-            if isinstance(histograms, DescriptionPart)
-            else tuple(len(group) for group in groups)
-        )
+        self._sizes = None
+        if not isinstance(histograms, DescriptionPart):
+            self._sizes = tuple(len(group) for group in groups)
         self.name = name
         self.source = source
         self.invariant_to = tuple(invariant_to)
-        flat = [histogram for group in groups for histogram in group]
         n_read = zip(SAMPLE_KINDS, self._n_read(training=False), strict=True)
-        self.requirements = replace(
-            reduce(or_, (histogram.requirements for histogram in flat)),
-            samples=tuple(kind for kind, n in n_read if n > 0),
-        )
+        samples = tuple(kind for kind, n in n_read if n > 0)
+        requirements = reduce(or_, (histogram.requirements for histogram in flat))
+        self.requirements = replace(requirements, samples=samples)
 
     def _n_read(self, training: bool) -> tuple[float, float]:
         """Return the largest numbers of interior and surface samples of a body that are read."""
@@ -288,12 +285,12 @@ class HistogramDescriptor(Descriptor):
     def parts(self) -> tuple[tuple[DescriptionPart, ...], ...]:
         """The histograms of each part."""
         histograms = [x for x in self.histograms if isinstance(x, DescriptionPart)]
-        sizes = self._sizes or (1,)
-        # Slices, as PyTorch 2.6 traces an iterator that is consumed in steps as if it started anew at each step.
-        return tuple(
-            tuple(histograms[end - size : end])
-            for size, end in zip(sizes, accumulate(sizes), strict=True)
-        )
+        parts = []
+        first = 0
+        for size in self._sizes or (1,):
+            parts.append(tuple(histograms[first : first + size]))
+            first += size
+        return tuple(parts)
 
     @property
     def histogram_shares(self) -> list[tuple[float, DescriptionPart]]:
@@ -330,9 +327,8 @@ class HistogramDescriptor(Descriptor):
 
         def concatenated(group: SignatureBatch) -> Tensor:
             features = BatchFeatures(group, self.training)
-            return torch.cat(
-                [share * histogram(features).flatten(1) for share, histogram in shares], dim=1
-            )
+            cells = [share * histogram(features).flatten(1) for share, histogram in shares]
+            return torch.cat(cells, dim=1)
 
         n_read = self._n_read(self.training)
 
@@ -375,8 +371,9 @@ class EmbeddedDescriptor(Descriptor):
     def n_features(self) -> int:
         """The embedding width D."""
         device = next(self.head.buffers()).device
+        descriptions = torch.ones(2, self.descriptor.n_features, device=device)
         with torch.no_grad():
-            return self.head(torch.ones(2, self.descriptor.n_features, device=device)).shape[1]
+            return self.head(descriptions).shape[1]
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """Return embeddings (N, D) of length 1."""
@@ -416,6 +413,6 @@ class EmbeddedDescriptor(Descriptor):
 
     def shorten(self, embeddings: Tensor) -> Tensor:
         """Return embeddings (N, D) with D ≤ 256 unchanged, others shortened by `Head.shorten`."""
-        return (
-            embeddings if embeddings.shape[1] <= MAX_SHORT_WIDTH else self.head.shorten(embeddings)
-        )
+        if embeddings.shape[1] <= MAX_SHORT_WIDTH:
+            return embeddings
+        return self.head.shorten(embeddings)

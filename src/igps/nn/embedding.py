@@ -39,8 +39,8 @@ def barycentroid_potential(embedding: Tensor) -> Tensor:
     if not embedding.requires_grad:
         return torch.linalg.vector_norm(embedding, dim=-1)
     is_zero = ~embedding.detach().any(dim=-1)  # padding, where the norm has no second derivative
-    norms = torch.linalg.vector_norm(embedding.masked_fill(is_zero.unsqueeze(-1), 1), dim=-1)
-    return norms.masked_fill(is_zero, 0)
+    apart = embedding.masked_fill(is_zero.unsqueeze(-1), 1)
+    return torch.linalg.vector_norm(apart, dim=-1).masked_fill(is_zero, 0)
 
 
 class SpectralEmbedding(Specified):
@@ -81,11 +81,14 @@ class SpectralEmbedding(Specified):
             return weights
         start, end = (math.log(x) for x in _FILTER_RANGE)
         last = len(self.log_gain) - 1
-        x = (eigenvalues * area.to(eigenvalues.dtype).unsqueeze(-1)).log()
-        position = ((x - start) * (last / (end - start))).clamp(0, last)
+        areas = area.to(eigenvalues.dtype).unsqueeze(-1)
+        x = (eigenvalues * areas).log()
+        position = (x - start) * (last / (end - start))
+        position = position.clamp(0, last)
         lower = position.long().clamp(max=last - 1)
-        gain = self.log_gain.to(weights.dtype)
-        return weights * torch.lerp(gain[lower], gain[lower + 1], position - lower).exp()
+        knots = self.log_gain.to(weights.dtype)
+        log_gain = torch.lerp(knots[lower], knots[lower + 1], position - lower)
+        return weights * log_gain.exp()
 
     def forward(self, eigenfunctions: Tensor, eigenvalues: Tensor, area: Tensor) -> Tensor:
         """Embed eigenfunctions (..., P, K) with eigenvalues (..., K) and areas (...)."""

@@ -5,7 +5,6 @@ from igps.nn._kernels.pairs_by_torch import (
     euclidean_distances,
     oriented_pairs,
     pair_twists,
-    point_pair_features,
 )
 from igps.nn.axes.points import soft_memberships
 from igps.nn.embedding import (
@@ -29,7 +28,6 @@ __all__ = [
     "pair_histogram",
     "pair_twists",
     "point_histogram",
-    "point_pair_features",
     "soft_memberships",
     "spectral_embedding",
     "square_root",

@@ -85,7 +85,8 @@ class _Copying:
         if isinstance(module, AxesHistogram):
             arguments["axes"] = list(module.axes)
         arguments = {name: self._argument(value) for name, value in arguments.items()}
-        changed = type(module)(**{**arguments, **self._changes(module)})
+        arguments |= self._changes(module)
+        changed = type(module)(**arguments)
         changed.load_state_dict(module.state_dict(), strict=False)
         return changed
 

@@ -285,8 +285,11 @@ class RetrievalLearner(LightningModule):
                 f"train_dataloaders: expected one DataLoader, got {type(loader).__name__}."
             )
         ordered = DataLoader(loader.dataset, batch_size=16, collate_fn=loader.collate_fn)
-        batches = [(self(batch.to(self.device)), _known_labels(batch)) for batch in ordered]
-        descriptions, labels = zip(*batches, strict=True)
+        descriptions = []
+        labels = []
+        for batch in ordered:
+            descriptions.append(self(batch.to(self.device)))
+            labels.append(_known_labels(batch))
         return torch.cat(descriptions), torch.cat(labels)
 
 

@@ -64,11 +64,11 @@ class Specified(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the arguments that are numbers or strings, for `repr`; PyTorch adds the submodules."""
-        return ", ".join(
-            f"{name}={x!r}"
-            for name, x in self.made_with().items()
-            if isinstance(x, int | float | str)
-        )
+        shown = []
+        for name, value in self.made_with().items():
+            if isinstance(value, int | float | str):
+                shown.append(f"{name}={value!r}")
+        return ", ".join(shown)
 
 
 def specification(module: nn.Module) -> dict[str, Any]:
@@ -91,18 +91,17 @@ def specification(module: nn.Module) -> dict[str, Any]:
             return value
         if isinstance(value, list | tuple):
             return [encode(x) for x in value]
-        if any(value is x for x in modules):
-            return {"same_as": next(i for i, x in enumerate(modules) if value is x)}
+        for position, known in enumerate(modules):
+            if value is known:
+                return {"same_as": position}
         path = f"{type(value).__module__}.{type(value).__qualname__}"
         if not isinstance(value, Specified) or not _CLASS.fullmatch(path):
             raise ValueError(
                 f"descriptor: expected to be made of modules of igps and numbers, got {path} in it."
             )
         modules.append(value)
-        return {
-            "class_path": path,
-            "init_args": {name: encode(x) for name, x in value.made_with().items()},
-        }
+        arguments = {name: encode(x) for name, x in value.made_with().items()}
+        return {"class_path": path, "init_args": arguments}
 
     encoded: dict[str, Any] = encode(module)
     return encoded
@@ -123,11 +122,8 @@ def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
             return modules[spec["same_as"]]
         path = spec["class_path"]
         arguments = spec.get("init_args", {})
-        if (
-            not set(spec) <= {"class_path", "init_args"}
-            or not _CLASS.fullmatch(path)
-            or len(modules) >= _MAX_MODULES
-        ):
+        is_module = set(spec) <= {"class_path", "init_args"} and _CLASS.fullmatch(path)
+        if not is_module or len(modules) >= _MAX_MODULES:
             raise ValueError(
                 f"{path!r} is no module of igps, or there are more than {_MAX_MODULES} modules"
             )
@@ -136,20 +132,22 @@ def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
         if not isinstance(cls, type) or not issubclass(cls, Specified):
             raise ValueError(f"{path} is no module of igps")
         sizes = [n for n in _integers(arguments.values()) if n > 1]
-        if max(sizes, default=0) > _MAX_NUMBER or (
-            "Head" in name and math.prod(sizes) > max(_MAX_PARAMETERS, n_bytes)
-        ):
+        max_parameters = max(_MAX_PARAMETERS, n_bytes) if "Head" in name else math.inf
+        if max(sizes, default=0) > _MAX_NUMBER or math.prod(sizes) > max_parameters:
             raise ValueError(f"{name} of {sizes} is too large")
         position = len(modules)
         # Placeholder, as the arguments may contain modules with later positions
         modules.append(nn.Identity())
-        modules[position] = cls(**{name: decode(x) for name, x in arguments.items()})
+        decoded = {name: decode(x) for name, x in arguments.items()}
+        modules[position] = cls(**decoded)
         return modules[position]
 
     def decode(value: Any) -> Any:
         if isinstance(value, Mapping):
             return build(value)
-        return tuple(map(decode, value)) if isinstance(value, list | tuple) else value
+        if isinstance(value, list | tuple):
+            return tuple(map(decode, value))
+        return value
 
     return build(spec)
 
@@ -164,13 +162,13 @@ def _integers(values: Any) -> Iterator[int]:
 
 def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) -> None:
     """Write a module of the library, its parameters and its card to a safetensors file or a folder."""
-    if Path(path).suffix != ".safetensors":
-        save_module(module, path := Path(path) / IN_FOLDER, card)
-        rows = (f"| {name} | `{json.dumps(value)}` |\n" for name, value in card.items())
-        text = _README.format(
-            name=getattr(module, "name", type(module).__name__), rows="".join(rows)
-        )
-        path.with_name("README.md").write_text(text, encoding="utf-8")
+    path = Path(path)
+    if path.suffix != ".safetensors":
+        save_module(module, path / IN_FOLDER, card)
+        name = getattr(module, "name", type(module).__name__)
+        rows = [f"| {fact} | `{json.dumps(value)}` |\n" for fact, value in card.items()]
+        text = _README.format(name=name, rows="".join(rows))
+        (path / "README.md").write_text(text, encoding="utf-8")
         return
     if any(map(is_lazy, module.parameters())):
         raise ValueError(
@@ -178,16 +176,15 @@ def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) ->
             "Train it, or call it with descriptions, before it is saved."
         )
     spec = specification(module)
-    _check_unchanged(
-        module, build_module(spec, sum(tensor.nbytes for tensor in module.state_dict().values()))
-    )
-    metadata = {"format": _FORMAT, "specification": json.dumps(spec), "card": json.dumps(card)}
     state = {
         name: value.detach().cpu().clone().contiguous()
         for name, value in module.state_dict().items()
     }
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(Path(path)) as file:
+    n_bytes = sum(tensor.nbytes for tensor in state.values())
+    _check_unchanged(module, build_module(spec, n_bytes))
+    metadata = {"format": _FORMAT, "specification": json.dumps(spec), "card": json.dumps(card)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as file:
         file.write(sort_metadata(save(state, metadata=metadata)))
 
 
@@ -198,22 +195,24 @@ def _check_unchanged(module: nn.Module, rebuilt: nn.Module) -> None:
         original = rebuilt_modules.get(path)
         if isinstance(original, LazyModuleMixin):
             continue  # The class of the original changes in its first call
-        changed = [""]
-        if type(original) is type(submodule):
-            public = {
-                name: x
-                for name, x in vars(original).items()
-                if name[0] != "_" and name != "training"
-            }
-            plain = {
-                name: x for name, x in public.items() if isinstance(x, int | float | str | tuple)
-            }
-            changed = [name for name, x in plain.items() if getattr(submodule, name, x) != x]
-        if changed:
-            name = ".".join(filter(None, (path, changed[0])))
+        changed = _changed_attribute(original, submodule)
+        if changed is not None:
+            name = ".".join(filter(None, (path, changed)))
             raise ValueError(
                 f"{name}: expected its initial value, got another, which is not saved. Make a new module."
             )
+
+
+def _changed_attribute(original: nn.Module | None, module: nn.Module) -> str | None:
+    """Return the first public attribute with another value than in the original, "" if the classes differ, or None."""
+    if type(original) is not type(module):
+        return ""
+    for name, value in vars(original).items():
+        is_public = name[0] != "_" and name != "training"
+        is_plain = isinstance(value, int | float | str | tuple)
+        if is_public and is_plain and getattr(module, name, value) != value:
+            return name
+    return None
 
 
 def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
@@ -221,7 +220,9 @@ def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
 
     Raises a FileNotFoundError for a missing file, and a ValueError for a damaged file or another format.
     """
-    path = Path(path) / IN_FOLDER if Path(path).is_dir() else Path(path)
+    path = Path(path)
+    if path.is_dir():
+        path = path / IN_FOLDER
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file. Check the path.")
     try:
@@ -231,13 +232,15 @@ def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
                 raise ValueError(f"its format is {metadata.get('format')!r}")
             module = build_module(json.loads(metadata["specification"]), path.stat().st_size)
             module.load_state_dict({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
-        if not all(bool(torch.isfinite(tensor).all()) for tensor in module.state_dict().values()):
-            raise ValueError("a parameter is not finite")
+        for tensor in module.state_dict().values():
+            if not bool(torch.isfinite(tensor).all()):
+                raise ValueError("a parameter is not finite")
         card = json.loads(metadata["card"])
         if not isinstance(card, dict):
             raise ValueError("its card is not a mapping")
     except _UNREADABLE as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        lines = str(error).splitlines()
+        reason = lines[0] if lines else type(error).__name__
         raise ValueError(
             f"{path}: expected a descriptor in the format {_FORMAT} ({reason}). Save it again."
         ) from error

@@ -19,7 +19,6 @@ from igps.nn.axes import (
     euclidean_distances,
     oriented_pairs,
     pair_twists,
-    point_pair_features,
 )
 from igps.nn.histograms import joint_histogram
 from loops import cosines, distances, pair_histogram_by_loops, twists
@@ -258,21 +257,19 @@ def test_features_are_those_of_a_loop():
     given = some(12)
     i, j = np.triu_indices(12, 1)
     expected = cosines(given["points"], given["directions"])
-    for feature, one in zip(
-        point_pair_features(given["points"], given["directions"]), expected, strict=True
-    ):
-        assert_allclose(feature, one[i, j], atol=1e-12)
+    pairs = oriented_pairs(given["points"], given["directions"], TOWARDS, AMONG)
+    for feature, one in zip(pairs.between(pairs.inputs, pairs.inputs), expected, strict=True):
+        assert_allclose(feature[i, j], one[i, j], atol=1e-12)
 
 
 def test_points_that_coincide_have_no_line(device):
     directions = some(2)["directions"].float().to(device)
     points = torch.rand(1, 3, device=device).expand(2, -1)
-    first, second, _ = point_pair_features(points, directions)
-    assert first == second == 0
     angles = torch.tensor([-1.0, 0.0, 1.0], device=device)
-    result = joint_histogram(
-        points.new_ones(2, 1), [oriented_pairs(points, directions, angles, angles)]
-    )
+    pairs = oriented_pairs(points, directions, angles, angles)
+    first, second, _ = pairs.between(pairs.inputs, pairs.inputs)[:, 0, 1]
+    assert first == second == 0
+    result = joint_histogram(points.new_ones(2, 1), [pairs])
     assert float(result[0, 1, 1].sum()) == pytest.approx(1)
 
 

@@ -109,7 +109,8 @@ def edge_graph(mesh: Mesh, points_per_edge: int = 0) -> sparse.csr_array:
     n_faces = len(mesh.faces)
     # Side i of a face runs from corner i to corner i + 1.
     edges, edge_of = undirected_edges(mesh.faces)
-    share = (np.arange(1, n + 1) / (n + 1))[None, :, None]
+    shares = np.arange(1, n + 1) / (n + 1)
+    share = shares[None, :, None]
     first = mesh.vertices[edges[:, :1]]
     last = mesh.vertices[edges[:, 1:]]
     between = (1 - share) * first + share * last

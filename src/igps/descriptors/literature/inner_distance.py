@@ -82,7 +82,8 @@ def _grid_indices(points: Floats) -> tuple[Integers, float]:
         )
     origin = points.min(axis=0)
     relative = points - origin
-    gaps = np.diff(np.sort(relative, axis=0), axis=0).T.ravel()
+    along_axes = np.sort(relative, axis=0)
+    gaps = np.diff(along_axes, axis=0).T.ravel()
     gaps = gaps[gaps > 1e-9 * relative.max()]  # others are rounding
     # Each gap is a multiple of the cell, but the smallest gap may be several cells.
     for divisor in (1, 2, 3, 4, 5):
@@ -142,7 +143,8 @@ def _connect(graph: sparse.csr_array, cells: Integers) -> sparse.csr_array:
             others = np.flatnonzero(component != i)
             length, nearest = KDTree(cells[own]).query(cells[others])
             closest = int(np.argmin(length))
-            link = own[nearest[closest]], others[closest]
-            bridge = sparse.coo_array(([length[closest]], ([link[0]], [link[1]])), graph.shape)
+            start = own[nearest[closest]]
+            end = others[closest]
+            bridge = sparse.coo_array(([length[closest]], ([start], [end])), graph.shape)
             # A maximum, as two components that are nearest to each other give the same link twice.
             graph = graph.maximum(bridge).maximum(bridge.T).tocsr()

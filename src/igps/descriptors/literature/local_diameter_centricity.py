@@ -129,5 +129,6 @@ def _robust_mean(lengths: Floats) -> Floats:
     is_outlier = np.abs(values - median) > deviation + 1e-9 * median
     trimmed = np.ma.masked_where(is_outlier, values)
     # If an even number of lengths forms two distant groups, none may be near the median. Then all are averaged.
-    means = np.ma.where(trimmed.count(axis=1) > 0, trimmed.mean(axis=1), values.mean(axis=1))
+    has_any = trimmed.count(axis=1) > 0
+    means = np.ma.where(has_any, trimmed.mean(axis=1), values.mean(axis=1))
     return np.asarray(means.filled(np.nan))

@@ -98,5 +98,6 @@ def quantiles(values: ArrayLike, n_quantiles: int) -> Floats:
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64), axis=None)
     integral = np.concatenate([[0.0], np.cumsum(ordered)]) / len(ordered)
+    shares = np.linspace(0, 1, len(integral))
     ends = np.linspace(0, 1, n_quantiles + 1)
-    return n_quantiles * np.diff(np.interp(ends, np.linspace(0, 1, len(integral)), integral))
+    return n_quantiles * np.diff(np.interp(ends, shares, integral))

@@ -128,7 +128,8 @@ def _stiffness(inside: Booleans) -> sparse.csr_array:
                 columns.append(next_cell[linked])
     row = np.concatenate(rows)
     column = np.concatenate(columns)
-    links = sparse.coo_array((np.ones(len(row)), (row, column)), shape=(n_cells, n_cells)).tocsr()
+    ones = np.ones(len(row))
+    links = sparse.coo_array((ones, (row, column)), shape=(n_cells, n_cells)).tocsr()
     return sparse.diags_array(diagonal[is_cell]) - links - links.T
 
 
@@ -143,6 +144,7 @@ def _smallest_eigenvalues(stiffness: sparse.csr_array, n_values: int) -> Floats:
         matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )
     inverse = LinearOperator(matrix.shape, factor.solve, matmat=factor.solve, dtype=np.float64)
-    start = np.random.default_rng(0).standard_normal((matrix.shape[0], n_values + _N_GUARDS))
+    random = np.random.default_rng(0)
+    start = random.standard_normal((matrix.shape[0], n_values + _N_GUARDS))
     values, _ = lobpcg(matrix, start, M=inverse, tol=_TOLERANCE, maxiter=_MAX_STEPS, largest=False)
     return np.sort(values)[:n_values]

@@ -114,8 +114,9 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
         source="nine histograms, fitted to generated shapes",
         invariant_to=("motion", "scale", "pose"),
     )
+    state = {name: tensor.float() for name, tensor in load_file(path).items()}
     try:
-        module.load_state_dict({name: tensor.float() for name, tensor in load_file(path).items()})
+        module.load_state_dict(state)
     except RuntimeError as error:
         raise ValueError(
             f"{path}: expected the parameters of `pretrained` of this version, got others."

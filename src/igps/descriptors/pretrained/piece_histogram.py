@@ -117,7 +117,8 @@ class PieceHistogram(SampleHistogram):
         is_small = n_points < _MIN_SAMPLES
         distinct = covariance.new_tensor([1, 0, 0, 0, 2, 0, 0, 0, 3])
         covariance = torch.where(is_small, distinct, covariance)
-        largest = torch.linalg.eigvalsh(covariance.unflatten(3, (3, 3)))[..., -1]
+        eigenvalues = torch.linalg.eigvalsh(covariance.unflatten(3, (3, 3)))
+        largest = eigenvalues[..., -1]
         sizes = n_points[..., 0] / mask.sum(dim=1)[:, None, None]
         squared_lengths = 12 * torch.where(is_small[..., 0], 0, largest) / sizes
         log_lengths = above_zero(squared_lengths).log2() / 2

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils._pytree import tree_leaves
 
 from igps._threads import one_thread
 from igps.data.batch import SignatureBatch
@@ -57,11 +58,11 @@ def map_by_size(
     """
     if torch.compiler.is_compiling() or batch.device.type == "meta":
         return function(batch)
-    lengths = torch.stack([_last(batch.interior.mask), _last(batch.surface.mask)], dim=1)
-    sizes: list[list[int]] = lengths.tolist()
-    read = [
-        (min(n_interior, n_read[0]), min(n_surface, n_read[1])) for n_interior, n_surface in sizes
-    ]
+    lengths = [_last(batch.interior.mask), _last(batch.surface.mask)]
+    sizes: list[list[int]] = torch.stack(lengths, dim=1).tolist()
+    read = []
+    for n_interior, n_surface in sizes:
+        read.append((min(n_interior, n_read[0]), min(n_surface, n_read[1])))
     groups = _of_about_one_size(read)
     if len(groups) > 1 and uses_loops(batch.device):
         # One body is a view of the batch, but several are copied, which costs more than a call for a large body.
@@ -122,14 +123,7 @@ def on_one_thread(
     """
     if not uses_loops(batch.device):
         return function(batch)
-    inputs: list[Tensor] = []
-
-    def collect(tensor: Tensor) -> Tensor:
-        if tensor.requires_grad:
-            inputs.append(tensor)
-        return tensor
-
-    batch.map(collect)
+    inputs = [tensor for tensor in tree_leaves(batch) if tensor.requires_grad]
     tensors = (*module.parameters(), *module.buffers())
     learned = [tensor for tensor in tensors if tensor.requires_grad]
     if not torch.is_grad_enabled() or not (inputs or learned):

@@ -22,12 +22,18 @@ from igps._compiled import FUSE, compiled
 
 Numbers = NDArray[Any]
 Indices = NDArray[np.int32]
-Members = tuple[Indices, Floats]
-"""The classes (M, P) of each point, and its weights in them."""
 
 # Kinds of axes: values given as numbers; distances, from inner products; three cosines at once, from oriented points.
 VALUES, DISTANCES, COSINES = 0, 1, 2
 _MAX_VECTOR = 32  # upper bound of the number of entries that a compiled loop processes at once
+
+
+class Members(NamedTuple):
+    """The classes of each point."""
+
+    classes: Indices  # (M, P)
+    weights: Floats  # (M, P) of the point in them
+    differs: Booleans  # (P,) whether its classes or weights differ from those of the point before
 
 
 class Axes(NamedTuple):
@@ -46,9 +52,8 @@ class Row(NamedTuple):
     """Results for the pairs of one row of a block, with an entry for each of J columns."""
 
     cells: Indices  # (J,) index of the cell of each pair, over all axes
-    shares: (
-        Numbers  # (K, J) position of the value between the centres below and above it, from 0 to 1
-    )
+    # (K, J) position of the value between the centres below and above it, from 0 to 1
+    shares: Numbers
     features: Numbers  # (S, 5, J) see `cosines`
     interval: Indices  # (J,) scratch space
 
@@ -111,7 +116,7 @@ def cosines(
     """Fill in the features (5, J) of a point and the points of the columns from ``start`` on.
 
     The features are the larger and the smaller cosine of the directions with the connecting line, the cosine between
-    the directions (see `point_pair_features`), 1 / length of the line, and the cosine of the point's own direction with
+    the directions (see `oriented_pairs`), 1 / length of the line, and the cosine of the point's own direction with
     the line. Points and directions are (D, P).
     """
     minus_one = features.dtype.type(-1)
@@ -133,9 +138,8 @@ def cosines(
         u = directions[d, point]
         xs = points[d, column + start :]
         us = directions[d, column + start :]
-        for j in range(
-            n
-        ):  # separate loops, as the compiler does not vectorise loops over many arrays
+        # Separate loops, as the compiler does not vectorise loops over many arrays
+        for j in range(n):
             line = xs[j] - x
             length[j] += line * line
             larger[j] += u * line
@@ -316,7 +320,7 @@ def pair_row(first: int, second: int, n_classes: int) -> int:
 @compiled()
 def flush(sums: Floats, start: int, end: int, members: Members, point: int, total: Floats) -> None:
     """Add columns [start, end) of the sums (C, cells·corners) to the total, by a point's weights (M, P); clear them."""
-    classes, weights = members
+    classes, weights, _ = members
     n_classes = len(sums)
     for other in range(n_classes):
         for m in range(len(classes)):
@@ -343,7 +347,7 @@ def new_sums(members: Members, column: int, n_columns: int, shape: tuple[int, in
     return Sums(
         cells,
         cells.reshape(n_classes, -1),
-        (members[0][:, column : column + n_columns] * n_cells).astype(np.int32),
+        (members.classes[:, column : column + n_columns] * n_cells).astype(np.int32),
         np.empty(n_columns),
     )
 
@@ -364,12 +368,12 @@ def count_block(
         values: (R, I, J) of the axes other than cosines, in order; inner products for distances. Overwritten.
         axes: see `Axes`.
         place: first point of the rows and of the columns.
-        members: (M, P) classes of each point, and its weights in them.
+        members: see `Members`.
         total: (C(C+1)/2, cells·2^K) to add to; among the corners, the last axis varies fastest.
         sums, result: of `new_sums` and `new_row`.
     """
     row, column = place
-    classes, weights = members
+    classes, weights, differs = members
     n_columns = values.shape[2]
     n_axes = len(axes.n_centres)
     n_members = len(classes)
@@ -384,17 +388,10 @@ def count_block(
         point = row + i
         first = max(point + 1 - column, 0)
         start = whole_vectors(first, n_columns)
-        if i > 0:
-            is_same = True
-            for m in range(n_members):
-                is_same &= (
-                    classes[m, point] == classes[m, point - 1]
-                    and weights[m, point] == weights[m, point - 1]
-                )
-            if not is_same:
-                begin = lowest * n_corners
-                flush(sums.by_class, begin, (highest + 1) * n_corners, members, point - 1, total)
-                lowest, highest = empty_range
+        if i > 0 and differs[point]:
+            begin = lowest * n_corners
+            flush(sums.by_class, begin, (highest + 1) * n_corners, members, point - 1, total)
+            lowest, highest = empty_range
         locate_row(values, i, axes, point, column, start, result)
         cell = result.cells[first:]
         shares = result.shares
@@ -447,7 +444,7 @@ def gradient_block(
         result: of `new_row`.
     """
     row, column = place
-    classes, weights = members
+    classes, weights, _ = members
     by_cosines, by_weights, by_centres, slopes = derivatives
     n_rows, n_columns = values.shape[1:]
     n_axes = len(axes.n_centres)
@@ -550,7 +547,7 @@ def distance_gradient(
     """
     values, cells, shares = row
     first, point, column = place
-    classes, weights = members
+    classes, weights, _ = members
     n_members = len(classes)
     n_classes = int(np.sqrt(2.0 * len(upstream)))
     for j in range(first, len(cells)):

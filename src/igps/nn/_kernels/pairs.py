@@ -17,11 +17,12 @@ from torch import Tensor, library
 from igps._tensors import with_axes_of
 from igps.nn._kernels import batches
 from igps.nn._kernels.pair_loops import VALUES
-from igps.nn._kernels.pairs_by_loops import CompiledCount, Layout
+from igps.nn._kernels.pairs_by_loops import CompiledCount
 from igps.nn._kernels.pairs_by_torch import (
     TEMPLATES,
+    Layout,
     PairValues,
-    centres_of,
+    bins_of,
     count_by_torch,
     with_tensors,
 )
@@ -70,25 +71,18 @@ def count_pairs(
         if is_compiled and len(templates) == len(pairs):
             counts = _operator(classes, n_classes, templates, mask, tensors)
         else:
-            counts = _count(classes, n_classes, pairs, mask, tensors)
+            counts = _count(Layout(classes, n_classes, pairs, mask), tensors)
         n_points = mask.sum(dim=1).double()
         n_pairs = n_points * (n_points - 1) / 2
         shares = counts / with_axes_of(n_pairs, counts)
         return shares.to(dtype)
 
 
-def _count(
-    classes: Tensor,
-    n_classes: int,
-    pairs: Sequence[PairValues],
-    mask: Tensor,
-    tensors: list[Tensor],
-) -> Tensor:
+def _count(layout: Layout, tensors: list[Tensor]) -> Tensor:
     """Return float64 counts (N, C(C+1)/2, B, ...), by the back end for the device and type of the tensors."""
     has_loops = tensors[0].dtype in (torch.float32, torch.float64)
-    if not has_loops or not batches.uses_loops(classes.device):
-        return count_by_torch(classes, n_classes, pairs, mask, *tensors)
-    layout = Layout(classes, n_classes, tuple(pairs), mask)
+    if not has_loops or not batches.uses_loops(layout.mask.device):
+        return count_by_torch(layout, *tensors)
     counts: Tensor = CompiledCount.apply(layout, *tensors)
     return counts
 
@@ -107,15 +101,15 @@ def _operator(
     classes: Tensor, n_classes: int, templates: list[int], mask: Tensor, tensors: list[Tensor]
 ) -> Tensor:
     """`_count` as an operator of PyTorch, with gradients by the tensors."""
-    return _count(classes, n_classes, _from_templates(templates, tensors), mask, tensors)
+    pairs = _from_templates(templates, tensors)
+    return _count(Layout(classes, n_classes, pairs, mask), tensors)
 
 
 @_operator.register_fake
 def _(
     classes: Tensor, n_classes: int, templates: list[int], mask: Tensor, tensors: list[Tensor]
 ) -> Tensor:
-    pairs = _from_templates(templates, tensors)
-    bins = [len(centres) for centres in centres_of(pairs)]
+    bins = bins_of(_from_templates(templates, tensors))
     n_rows = len(class_pairs(n_classes))
     return classes.new_empty(mask.shape[0], n_rows, *bins, dtype=torch.float64)
 
@@ -141,7 +135,8 @@ def _gradients(
         torch.enable_grad(),
     ):
         leaves = [tensor.detach().requires_grad_() for tensor in tensors]
-        counts = _count(classes, n_classes, _from_templates(templates, leaves), mask, leaves)
+        pairs = _from_templates(templates, leaves)
+        counts = _count(Layout(classes, n_classes, pairs, mask), leaves)
         return list(torch.autograd.grad(counts, leaves, upstream))
 
 
@@ -189,7 +184,7 @@ def check_pairs(pairs: Sequence[PairValues], mask: Tensor) -> None:
         raise ValueError(f"points: expected at least two points to form a pair, got {n_points}.")
     for pair in pairs:
         for values in pair.inputs:
-            _check_values(values.detach(), mask, are_squared=VALUES not in pair.kinds)
+            _check_values(values.detach(), mask, are_squared=pair.kind != VALUES)
 
 
 def _check_values(values: Tensor, mask: Tensor, are_squared: bool) -> None:

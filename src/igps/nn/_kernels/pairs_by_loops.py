@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from igps.nn._kernels.pair_loops import (
     Axes,
     Derivatives,
     Indices,
+    Members,
     Numbers,
     count_block,
     gradient_block,
@@ -29,7 +30,7 @@ from igps.nn._kernels.pair_loops import (
 )
 from igps.nn._kernels.pairs_by_torch import (
     Inputs,
-    PairValues,
+    Layout,
     centres_of,
     cosine_products,
     count_by_torch,
@@ -47,15 +48,6 @@ _N_SHARES = 4
 _MAX_COUNTS = 2**24
 
 Blocks = Sequence[tuple[int, int]]
-
-
-class Layout(NamedTuple):
-    """The arguments of `count_pairs` for which no gradient is computed."""
-
-    classes: Tensor
-    n_classes: int
-    pairs: tuple[PairValues, ...]
-    mask: Tensor
 
 
 class CompiledCount(torch.autograd.Function):
@@ -83,7 +75,7 @@ class CompiledCount(torch.autograd.Function):
         layout = ctx.shapes.layout
         arguments = ctx.saved_tensors
         if torch.is_grad_enabled():  # for second derivatives, which the loops do not have
-            counts = count_by_torch(*layout, *arguments)
+            counts = count_by_torch(layout, *arguments)
             leaves = [tensor for tensor in arguments if tensor.requires_grad]
             found = torch.autograd.grad(
                 counts, leaves, upstream, create_graph=True, allow_unused=True
@@ -141,7 +133,8 @@ class _Shapes:
         for classes, share in zip(layout.classes.unbind(2), weights.unbind(2), strict=True):
             key = key * layout.n_classes + torch.where(share > 0, classes, 0)
         last = torch.iinfo(key.dtype).max  # sorts padding to the end
-        self.order = torch.argsort(key.masked_fill(~layout.mask, last), dim=1, stable=True)
+        key = key.masked_fill(~layout.mask, last)
+        self.order = torch.argsort(key, dim=1, stable=True)
         by_order = self.order.unsqueeze(2).expand_as(layout.classes)
         sorted_classes = layout.classes.gather(1, by_order).int()
         sorted_weights = weights.gather(1, by_order).double()
@@ -158,15 +151,15 @@ class _Shapes:
         n_corners = 2 ** len(self.bins)
         self.sums_shape = layout.n_classes, n_cells, n_corners
         self.n_counts = layout.n_classes * (layout.n_classes + 1) // 2, n_cells * n_corners
-        kinds = [kind for pair in layout.pairs for kind in pair.kinds]
-        self.n_oriented = kinds.count(COSINES)
-        self.n_values = len(kinds) - self.n_oriented
+        kinds: list[int] = []
         self.matrices: list[slice] = []  # those of the values of each pair, none for cosines
-        first = 0
+        self.n_values = 0
         for pair in layout.pairs:
-            end = first if COSINES in pair.kinds else first + len(pair.kinds)
-            self.matrices.append(slice(first, end))
-            first = end
+            n_matrices = 0 if pair.kind == COSINES else len(pair.centres)
+            kinds += [pair.kind] * max(n_matrices, 1)
+            self.matrices.append(slice(self.n_values, self.n_values + n_matrices))
+            self.n_values += n_matrices
+        self.n_oriented = kinds.count(COSINES)
         padded = pad_sequence(centres, batch_first=True).numpy()
         empty = np.empty(0)  # in place of the norms and vectors of each shape
         gaps = _inverse_gaps(padded, self.bins)
@@ -197,11 +190,12 @@ class _Shape:
         self.n_points = n_points
         self.order = shapes.order[number, :n_points]
         self.products: Tensor | None = None  # of `keep_products`
-        classes, weights = shapes.members_to_count if upstream is None else shapes.members
-        self.members = (
-            np.ascontiguousarray(classes[number, :, :n_points]),
-            np.ascontiguousarray(weights[number, :, :n_points]),
-        )
+        padded = shapes.members_to_count if upstream is None else shapes.members
+        classes, weights = (np.ascontiguousarray(x[number, :, :n_points]) for x in padded)
+        changes = (np.diff(classes) != 0) | (np.diff(weights) != 0)
+        differs = np.ones(n_points, bool)
+        differs[1:] = changes.any(axis=0)
+        self.members = Members(classes, weights, differs)
         own = []
         for tensor in tensors:
             is_of_points = tensor.ndim > 1  # and not centres
@@ -229,10 +223,10 @@ class _Shape:
         vectors = []
         for pair, matrices in zip(self.pairs, shapes.matrices, strict=True):
             centred = None
-            if DISTANCES in pair.kinds:
+            if pair.kind == DISTANCES:
                 centred = _centre(pair.inputs[0])
                 norms[matrices] = centred.square().sum(dim=1)
-            elif COSINES in pair.kinds:
+            elif pair.kind == COSINES:
                 vectors.append(torch.stack([x.T for x in pair.inputs], dim=1))
             self.centred.append(centred)
         oriented = norms.new_zeros(0, 2, 0, n_points)
@@ -265,7 +259,7 @@ class _Shape:
 
     def gradients(self, blocks: Blocks) -> list[Tensor]:
         """Return the derivatives by the weights, the centres, and the inputs of each axis."""
-        by_weights = torch.zeros(self.members[1].shape, dtype=torch.float64, device="cpu")
+        by_weights = torch.zeros(self.members.weights.shape, dtype=torch.float64, device="cpu")
         by_centres = torch.zeros(self.axes.centres.shape, dtype=torch.float64, device="cpu")
         by_inputs = [[torch.zeros_like(x) for x in pair.inputs] for pair in self.pairs]
         for row, column in blocks:
@@ -292,7 +286,7 @@ class _Shape:
             for pair, centred, matrices, totals in zip(
                 self.pairs, self.centred, self.shapes.matrices, by_inputs, strict=True
             ):
-                if COSINES in pair.kinds:
+                if pair.kind == COSINES:
                     upstream = next(remaining)
                     _add_by_inputs(_cosine_products, upstream[:3], pair.inputs, sides, totals)
                     _add_by_points(upstream[3], pair.inputs[0], sides, totals[0])
@@ -320,7 +314,7 @@ class _Shape:
         ):
             if centred is not None:
                 _write_products(centred, rows, columns, values[matrices.start])
-            elif VALUES in pair.kinds:
+            elif pair.kind == VALUES:
                 between = pair.between(*_at(pair.inputs, rows, columns))
                 values[matrices] = between[0]
         return values
@@ -361,10 +355,11 @@ def _inverse_gaps(centres: Numbers, bins: Sequence[int]) -> tuple[Numbers, Boole
     inverse = np.zeros((len(bins), centres.shape[1] - 1), centres.dtype)
     is_equal = np.zeros(len(bins), bool)
     for k, n in enumerate(bins):
-        gaps = np.diff(centres[k, :n])
+        own = centres[k, :n]
+        gaps = np.diff(own)
         inverse[k, : n - 1] = 1 / gaps
-        mean = float(centres[k, n - 1] - centres[k, 0]) / (n - 1)
-        largest = float(np.abs(centres[k, [0, n - 1]]).max())
+        mean = float(own[-1] - own[0]) / (n - 1)
+        largest = float(np.abs(own).max())
         rounding = 8 * np.finfo(centres.dtype).eps * largest
         is_equal[k] = (np.abs(gaps - mean) <= rounding).all()
         if is_equal[k]:
@@ -409,8 +404,10 @@ def _add_by_points(
         both = by_squares + by_squares.T
         total[rows] += 2 * (x * both.sum(dim=1, keepdim=True) - both @ x)
         return
-    total[rows] += 2 * (x * by_squares.sum(dim=1, keepdim=True) - by_squares @ y)
-    total[columns] += 2 * (y * by_squares.sum(dim=0).unsqueeze(1) - by_squares.T @ x)
+    by_row = by_squares.sum(dim=1, keepdim=True)
+    by_column = by_squares.sum(dim=0).unsqueeze(1)
+    total[rows] += 2 * (x * by_row - by_squares @ y)
+    total[columns] += 2 * (y * by_column - by_squares.T @ x)
 
 
 def _add_corners_to_bins(total: Tensor, bins: Sequence[int]) -> Tensor:
@@ -427,5 +424,6 @@ def _copy_bins_to_corners(upstream: Tensor) -> Tensor:
     """Return derivatives (rows, cells·2^K) by the counts of corners from derivatives (rows, B, ...) by bins."""
     n_axes = upstream.ndim - 1
     for axis in range(n_axes):
-        upstream = torch.stack([upstream, upstream.roll(-1, dims=1 + axis)], dim=-1)
+        above = upstream.roll(-1, dims=1 + axis)
+        upstream = torch.stack([upstream, above], dim=-1)
     return upstream.flatten(1).contiguous()

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,12 +30,7 @@ class PairValues:
     centres: tuple[Tensor, ...]  # (B,) ascending, for each of the k values
     # Differentiable function from inputs (N, I, ...) of I points and (N, J, ...) of J points to values (N, k, I, J)
     between: Callable[[Inputs, Inputs], Tensor]
-    # How compiled loops obtain the values, see `pair_loops`; by default from `between`
-    kinds: tuple[int, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not self.kinds:
-            object.__setattr__(self, "kinds", (VALUES,) * len(self.centres))
+    kind: int = VALUES  # how compiled loops obtain the values, see `pair_loops`
 
 
 def euclidean_distances(points: Tensor, centres: Tensor) -> PairValues:
@@ -44,13 +40,17 @@ def euclidean_distances(points: Tensor, centres: Tensor) -> PairValues:
         points: (N, P, D) or (P, D).
         centres: (B,) ascending.
     """
-    return PairValues((points,), (centres,), _distances, (DISTANCES,))
+    return PairValues((points,), (centres,), _distances, DISTANCES)
 
 
 def oriented_pairs(
     points: Tensor, directions: Tensor, towards: Tensor, among: Tensor
 ) -> PairValues:
-    """Return the three `point_pair_features` of points with directions.
+    """Return three cosines of each pair of points with directions (Wahl et al. 2003; Drost et al. 2010).
+
+    With u the unit vector from point i to point j, and nᵢ and nⱼ the directions, the cosines are the larger and the
+    smaller of nᵢ·u and −nⱼ·u, and nᵢ·nⱼ. The first two are 1 if a direction points to the other point, and 0 for
+    coinciding points. All three are symmetric in i and j.
 
     Args:
         points: (N, P, D) or (P, D).
@@ -65,7 +65,7 @@ def oriented_pairs(
     shape = tuple(directions.shape)
     if shape != expected:
         raise ValueError(f"directions: expected the shape of the points, {expected}, got {shape}.")
-    return PairValues((points, directions), (towards, towards, among), _cosines, (COSINES,))
+    return PairValues((points, directions), (towards, towards, among), _cosines, COSINES)
 
 
 def pair_twists(points: Tensor, directions: Tensor, centres: Tensor) -> PairValues:
@@ -93,27 +93,9 @@ def _extended(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """Return (x, 1) and (u, −u·x) for points x with directions u, as u·(y − x) is their product for x and y."""
     own = (directions * points).sum(dim=-1, keepdim=True)
     ones = torch.ones_like(points[..., :1])
-    return torch.cat([points, ones], dim=-1), torch.cat([directions, -own], dim=-1)
-
-
-def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return three cosines of each pair of oriented points (Wahl et al. 2003; Drost et al. 2010).
-
-    With u the unit vector from point i to point j, and nᵢ and nⱼ the directions, the cosines are the larger and the
-    smaller of nᵢ·u and −nⱼ·u, and nᵢ·nⱼ. The first two are 1 if a direction points to the other point. All three are
-    symmetric in i and j.
-
-    Args:
-        points: (P, D).
-        directions: (P, D) of length 1.
-
-    Returns:
-        Three tensors (P(P−1)/2,), in the order of `torch.triu_indices`. The first two are 0 for coinciding points.
-    """
-    i, j = torch.triu_indices(len(points), len(points), 1, device=points.device)
-    oriented = (points, directions)
-    first, second, among = _cosines(oriented, oriented)[:, i, j]
-    return first, second, among
+    extended_points = torch.cat([points, ones], dim=-1)
+    extended_directions = torch.cat([directions, -own], dim=-1)
+    return extended_points, extended_directions
 
 
 def _distances(rows: Inputs, columns: Inputs) -> Tensor:
@@ -139,7 +121,9 @@ def _twists(rows: Inputs, columns: Inputs) -> Tensor:
     m = rows[1]
     n = columns[1]
     # (m × n)·(q − p) = m·(n × q) − (p × m)·n, which are matrix products
-    triple = m @ torch.linalg.cross(n, q).mT - torch.linalg.cross(p, m) @ n.mT
+    row_moments = torch.linalg.cross(p, m)
+    column_moments = torch.linalg.cross(n, q)
+    triple = m @ column_moments.mT - row_moments @ n.mT
     twists = triple * _inverse_distances(p, q)
     return twists.clamp(-1, 1).unsqueeze(-3)
 
@@ -182,6 +166,11 @@ def centres_of(pairs: Sequence[PairValues]) -> list[Tensor]:
     return [centres for pair in pairs for centres in pair.centres]
 
 
+def bins_of(pairs: Sequence[PairValues]) -> list[int]:
+    """Return the number of bins of each value, in order."""
+    return [len(centres) for centres in centres_of(pairs)]
+
+
 def with_tensors(pairs: Sequence[PairValues], tensors: Sequence[Tensor]) -> list[PairValues]:
     """Return the values with their inputs and centres replaced by tensors, in order."""
     remaining = iter(tensors)
@@ -215,19 +204,22 @@ def _centres_at(centres: Tensor, indices: Tensor) -> Tensor:
     return in_each_row.gather(1, rows).view_as(indices)
 
 
-def count_by_torch(
-    classes: Tensor,
-    n_classes: int,
-    pairs: Sequence[PairValues],
-    mask: Tensor,
-    weights: Tensor,
-    *tensors: Tensor,
-) -> Tensor:
+class Layout(NamedTuple):
+    """The arguments of `count_pairs` for which no gradient is computed."""
+
+    classes: Tensor
+    n_classes: int
+    pairs: Sequence[PairValues]
+    mask: Tensor
+
+
+def count_by_torch(layout: Layout, weights: Tensor, *tensors: Tensor) -> Tensor:
     """Return float64 counts (N, C(C+1)/2, B, ...), see `count_pairs`."""
+    classes, n_classes, pairs, mask = layout
     clean = [_without_padding(tensor, mask) for tensor in tensors]
     weights = _without_padding(weights, mask)
     n_shapes, n_points, n_members = classes.shape
-    bins = [len(centres) for centres in centres_of(pairs)]
+    bins = bins_of(pairs)
     n_cells = n_classes * math.prod(bins)
     if isinstance(n_shapes, torch.SymInt) or isinstance(n_points, torch.SymInt):
         # A program for any number of shapes or points has one block, as tracing would fix the number of blocks.
@@ -240,7 +232,7 @@ def count_by_torch(
         firsts = range(0, n_points - 1, n_rows)
     total = torch.zeros(n_shapes, n_classes, n_cells, dtype=torch.float64, device=classes.device)
     for first in firsts:
-        task = partial(_count_rows, first, first + n_rows, classes, n_classes, pairs)
+        task = partial(_count_rows, first, first + n_rows, layout)
         # The gradient computes the values of pairs again, as storing them takes much more memory than the points.
         if torch.is_grad_enabled():
             total = total + checkpoint(task, weights, *clean, use_reentrant=False)
@@ -261,17 +253,11 @@ def _without_padding(tensor: Tensor, mask: Tensor) -> Tensor:
     return tensor.masked_fill(with_axes_of(~mask, tensor), 0)
 
 
-def _count_rows(
-    first: int,
-    end: int,
-    classes: Tensor,
-    n_classes: int,
-    pairs: Sequence[PairValues],
-    weights: Tensor,
-    *others: Tensor,
-) -> Tensor:
+def _count_rows(first: int, end: int, layout: Layout, weights: Tensor, *others: Tensor) -> Tensor:
     """Return counts (N, C, C·cells), by both classes, of pairs of the points [first, end) with later points."""
-    pairs = with_tensors(pairs, others)
+    classes = layout.classes
+    n_classes = layout.n_classes
+    pairs = with_tensors(layout.pairs, others)
     values = []
     with full_precision():
         for pair in pairs:
@@ -280,20 +266,21 @@ def _count_rows(
             values.append(pair.between(rows, columns))
     # Each row is first counted separately, by the class of the column's point only, as this adds fewer numbers, and few
     # to the same cell. Indices and weights are (N, I, J, M), finally (N, I, J, M·2^K), for the corners of each cell.
-    centres = centres_of(pairs)
+    bins = bins_of(pairs)
     index = classes[:, None, first:]
     shares = []
-    for value, its_centres in zip(torch.cat(values, dim=1).unbind(1), centres, strict=True):
-        below, share = find_intervals(value, its_centres)
+    each_value = torch.cat(values, dim=1).unbind(1)
+    for value, centres in zip(each_value, centres_of(pairs), strict=True):
+        below, share = find_intervals(value, centres)
         shares.append(share)
-        index = index * len(its_centres) + below.unsqueeze(3)
+        index = index * len(centres) + below.unsqueeze(3)
     # Pairs of a point with itself or with an earlier point have weight 0.
     is_later = torch.ones_like(values[0][0, 0]).triu(1)
     weight = weights[:, None, first:] * is_later.unsqueeze(2)
-    n_cells = math.prod(len(x) for x in centres)
+    n_cells = math.prod(bins)
     stride = n_cells
-    for share, its_centres in zip(shares, centres, strict=True):
-        stride //= len(its_centres)
+    for share, n_bins in zip(shares, bins, strict=True):
+        stride //= n_bins
         upper = weight * share.unsqueeze(3)
         # Not weight·(1 − share), nor a difference of sums, as rounding could make them negative.
         weight = torch.cat([weight - upper, upper], dim=3)

@@ -9,7 +9,6 @@ from igps.nn._kernels.pairs_by_torch import (
     euclidean_distances,
     oriented_pairs,
     pair_twists,
-    point_pair_features,
 )
 from igps.nn.axes.centres import OrderedCentres
 from igps.nn.axes.pairs import (
@@ -40,7 +39,6 @@ __all__ = [
     "euclidean_distances",
     "oriented_pairs",
     "pair_twists",
-    "point_pair_features",
 ]
 
 AXES: dict[str, type[PointAxis | PairAxis]] = {

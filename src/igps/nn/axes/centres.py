@@ -40,12 +40,9 @@ class OrderedCentres(Specified):
     def __init__(self, start: Tensor | Sequence[float], learnable: bool = False) -> None:
         super().__init__()
         values = torch.as_tensor(start, dtype=torch.float32)
-        if (
-            values.ndim != 1
-            or not len(values)
-            or not torch.isfinite(values).all()
-            or (values.diff() <= 0).any()
-        ):
+        is_row = values.ndim == 1 and len(values) > 0
+        ascends = is_row and bool((values.diff() > 0).all())
+        if not ascends or not torch.isfinite(values).all():
             raise ValueError(
                 f"start: expected finite values in ascending order, got {values.tolist()}."
             )
@@ -58,12 +55,11 @@ class OrderedCentres(Specified):
         if self.log_gap is None:
             return self.start
         first = self.start[:1]
-        origin = (
-            torch.where(first > 0, 0, first - self.start.diff()[:1])
-            if len(self.start) > 1
-            else first.clamp(max=0)
-        )
+        origin = first.clamp(max=0)
+        if len(self.start) > 1:
+            origin = torch.where(first > 0, 0, first - self.start.diff()[:1])
         gaps = torch.cat([origin, self.start]).diff()
         # What is added to each gap, so that centres at the start are exact.
         gain = softplus(self.log_gap) - softplus(torch.zeros_like(self.log_gap))
-        return self.start + (gaps * gain * ((1 - _MIN_GAP) / math.log(2))).cumsum(0)
+        added = gaps * gain * ((1 - _MIN_GAP) / math.log(2))
+        return self.start + added.cumsum(0)

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from torch import Tensor, nn
 
 from igps._parameters import check_at_least
-from igps.data.requirements import Requirements, embedding_requirements
+from igps.data.requirements import SURFACE_DIRECTION, Requirements, embedding_requirements
 from igps.nn._kernels.pairs_by_torch import (
     PairValues,
     euclidean_distances,
@@ -152,7 +152,7 @@ class PairCosines(_CosineAxes):
 
     def requirements(self, embedding: nn.Module) -> Requirements:
         """Return the requirement of surface directions."""
-        return Requirements(attributes=("surface_direction",))
+        return SURFACE_DIRECTION
 
     def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Return the cosines of the positions over √area and the surface directions."""
@@ -199,7 +199,7 @@ class PairTwist(PairAxis):
 
     def requirements(self, embedding: nn.Module) -> Requirements:
         """Return the requirement of surface directions."""
-        return Requirements(attributes=("surface_direction",))
+        return SURFACE_DIRECTION
 
     def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Return the twists of the positions over √area and the surface directions."""

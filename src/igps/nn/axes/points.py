@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from igps._parameters import check_at_least, check_one_of
 from igps.data.attribute_sources import named_source
-from igps.data.requirements import Requirements, embedding_requirements
+from igps.data.requirements import SURFACE_DIRECTION, Requirements, embedding_requirements
 from igps.nn._kernels.pairs_by_torch import find_intervals
 from igps.nn.axes.centres import OrderedCentres, interval_centres
 from igps.nn.batch_features import SampleFeatures
@@ -64,16 +64,15 @@ class PointAxis(Specified, ABC):
         classes that are learned have M = 2, one of them with weight 0. Raises a ValueError if a value in the mask
         (..., P) is not finite.
         """
-        # Code traced by `torch.compile` cannot raise.
-        if (
-            not torch.compiler.is_compiling()
-            and not torch.isfinite(torch.where(mask, values, 0)).all()
-        ):
+        is_traced = torch.compiler.is_compiling()  # traced code cannot raise
+        if not is_traced and not torch.isfinite(torch.where(mask, values, 0)).all():
             raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
         centres = self.centres().to(values.dtype)
-        boundaries = (centres.detach()[1:] + centres.detach()[:-1]) / 2
+        fixed = centres.detach()
+        boundaries = (fixed[1:] + fixed[:-1]) / 2
         nearest = torch.bucketize(values.detach(), boundaries, right=True).unsqueeze(-1)
-        if len(centres) == 1 or not (self.soft or (self.learnable and torch.is_grad_enabled())):
+        is_shared = self.soft or (self.learnable and torch.is_grad_enabled())
+        if len(centres) == 1 or not is_shared:
             return nearest, torch.ones_like(nearest, dtype=values.dtype)
         below, share = find_intervals(values, centres)
         classes = torch.stack([below, below + 1], dim=-1)
@@ -153,7 +152,7 @@ class BallRadius(PointAxis):
 
     def requirements(self, embedding: nn.Module) -> Requirements:
         """Return the requirement of surface directions."""
-        return Requirements(attributes=("surface_direction",))
+        return SURFACE_DIRECTION
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """Return the logarithms (N, P) of the radii over √area; raise a ValueError for interior samples."""
@@ -210,8 +209,11 @@ class Attribute(PointAxis):
     def fit(self, values: Tensor) -> None:
         """Set the centres to the quantiles of values (P,) at (i + 1/2) / n; equal quantiles are moved apart."""
         n = len(self.centres.start)
-        centres = torch.quantile(values.double(), (torch.arange(n, dtype=torch.float64) + 0.5) / n)
-        min_gap = max(float(values.double().std()), float(values.abs().max()), 1e-12) * 1e-4
+        values = values.double()
+        shares = (torch.arange(n, dtype=torch.float64) + 0.5) / n
+        centres = torch.quantile(values, shares)
+        size = max(float(values.std()), float(values.abs().max()), 1e-12)
+        min_gap = size * 1e-4
         for i in range(1, n):
             centres[i] = max(centres[i], centres[i - 1] + min_gap)
         self.centres.start.copy_(centres)
@@ -254,10 +256,12 @@ def soft_memberships(values: Tensor, centres: Tensor) -> Tensor:
     Values below the first or above the last centre belong only to that class. Differentiable in both arguments.
     """
     # Position of a value between each centre and the next, from 0 to 1; the hats are differences of these positions.
-    position = ((values.unsqueeze(-1) - centres[:-1]) / centres.diff()).clamp(0, 1)
-    ones = torch.ones_like(values).unsqueeze(-1)
-    zeros = torch.zeros_like(values).unsqueeze(-1)
-    return torch.cat([ones, position], dim=-1) - torch.cat([position, zeros], dim=-1)
+    values = values.unsqueeze(-1)
+    position = (values - centres[:-1]) / centres.diff()
+    position = position.clamp(0, 1)
+    rising = torch.cat([torch.ones_like(values), position], dim=-1)
+    falling = torch.cat([position, torch.zeros_like(values)], dim=-1)
+    return rising - falling
 
 
 def largest_members(memberships: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -268,6 +272,7 @@ def largest_members(memberships: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """
     n_members = memberships.shape[2]
     if not (memberships.requires_grad or torch.compiler.is_compiling()):
-        n_members = int((memberships > 0).sum(dim=2).masked_fill(~mask, 1).max())
+        n_each = (memberships > 0).sum(dim=2)
+        n_members = int(n_each.masked_fill(~mask, 1).max())
     weights, classes = memberships.topk(n_members, dim=2)
     return classes, weights

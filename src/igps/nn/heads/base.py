@@ -134,10 +134,8 @@ def class_members(descriptions: Tensor, labels: Tensor) -> Tensor:
 def class_means(rows: Tensor, members: Tensor) -> Tensor:
     """Return the means (C, D) of rows (N, D) by their classes (N,), which are numbered from 0 without gaps."""
     n_members = torch.bincount(members)
-    return (
-        rows.new_zeros(len(n_members), rows.shape[1]).index_add_(0, members, rows)
-        / n_members[:, None]
-    )
+    sums = rows.new_zeros(len(n_members), rows.shape[1]).index_add_(0, members, rows)
+    return sums / n_members[:, None]
 
 
 def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
@@ -147,12 +145,15 @@ def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """
     n_rows, width = rows.shape
     is_wide = width > n_rows
-    # Of the smaller matrix
-    squares, axes = torch.linalg.eigh(rows @ rows.T if is_wide else rows.T @ rows)
-    n = min(n, int((squares > _MIN_RELATIVE_SQUARE * squares[-1]).sum()))
+    smaller = rows @ rows.T if is_wide else rows.T @ rows
+    squares, axes = torch.linalg.eigh(smaller)
+    has_extent = squares > _MIN_RELATIVE_SQUARE * squares[-1]
+    n = min(n, int(has_extent.sum()))
     squares = squares.flip(0)[:n]
-    axes = axes.flip(1)[:, :n]
-    return (axes.T @ rows) / squares.sqrt()[:, None] if is_wide else axes.T, squares
+    directions = axes.flip(1)[:, :n].T
+    if is_wide:
+        directions = (directions @ rows) / squares.sqrt()[:, None]
+    return directions, squares
 
 
 def within_class_whitening(
@@ -169,10 +170,12 @@ def within_class_whitening(
     """
     directions, squares = principal_directions(residuals, min(n, rank))
     relative = squares * rank / residuals.square().sum()
-    return directions, (shrinkage / (shrinkage + relative)).sqrt()
+    gains = shrinkage / (shrinkage + relative)
+    return directions, gains.sqrt()
 
 
 def damped(rows: Tensor, directions: Tensor, gains: Tensor) -> Tensor:
     """Return rows (N, D) whose component along each orthonormal direction (k, D) is multiplied by a gain (k,)."""
     directions = directions.to(rows.dtype)  # the head may be in half precision
-    return rows - ((rows @ directions.T) * (1 - gains)) @ directions
+    along = rows @ directions.T
+    return rows - (along * (1 - gains)) @ directions

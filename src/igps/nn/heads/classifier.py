@@ -108,7 +108,8 @@ class ClassifierHead(KernelHead, ClassifyingHead):
             head.fit(descriptions[~held_out], labels[~held_out], part_cells, calibrate=False)
             scores.append(head.scores(descriptions[held_out]))
             strangeness.append(head.strangeness(descriptions[held_out]))
-            classes.append(torch.searchsorted(head.classes, labels[held_out].to(head.classes)))
+            own = labels[held_out].to(head.classes)
+            classes.append(torch.searchsorted(head.classes, own))
         super().fit(descriptions, labels, part_cells)
         self.members = torch.searchsorted(self.classes, labels.to(self.classes))
         if classes:
@@ -117,7 +118,8 @@ class ClassifierHead(KernelHead, ClassifyingHead):
             losses = [
                 functional.cross_entropy(logits / t, targets) for t in _TEMPERATURES.to(logits)
             ]
-            self.calibration.copy_(_TEMPERATURES[int(torch.stack(losses).argmin())])
+            best = int(torch.stack(losses).argmin())
+            self.calibration.copy_(_TEMPERATURES[best])
             self.strange_from.copy_(torch.cat(strangeness).quantile(1 - FALSE_UNKNOWN_RATE))
         return self
 
@@ -128,16 +130,16 @@ class ClassifierHead(KernelHead, ClassifyingHead):
     def strangeness(self, descriptions: Tensor) -> Tensor:
         """Return the strangeness (N,) of histograms (N, ...); classes are unknown from `strange_from` on."""
         scores, predicted = self.scores(descriptions).max(dim=1)
-        part_distances = self._distances(self._vectors(descriptions)) / self.medians[:, None, None]
+        part_distances = self._distances(self._vectors(descriptions))
+        part_distances = part_distances / self.medians[:, None, None]
         distances = torch.einsum("k,kij->ij", self.shares, part_distances)
-        other = self.members != predicted[:, None]
-        nearest = (
-            distances.masked_fill(other, math.inf)
-            .topk(min(_N_NEAREST, len(self.members)), largest=False)
-            .values
-        )
+        is_other = self.members != predicted[:, None]
+        to_class = distances.masked_fill(is_other, math.inf)
+        n_nearest = min(_N_NEAREST, len(self.members))
+        nearest = to_class.topk(n_nearest, largest=False).values
         is_real = torch.isfinite(nearest)  # a class may have fewer shapes
-        return nearest.where(is_real, 0).sum(dim=1) / is_real.sum(dim=1) - scores
+        mean = nearest.where(is_real, 0).sum(dim=1) / is_real.sum(dim=1)
+        return mean - scores
 
 
 def folds(labels: Tensor, n_folds: int = _MAX_FOLDS) -> Iterator[Tensor]:
@@ -150,8 +152,9 @@ def folds(labels: Tensor, n_folds: int = _MAX_FOLDS) -> Iterator[Tensor]:
     for offset, label in enumerate(labels.unique().tolist()):
         members = torch.nonzero(labels.cpu() == label).flatten()
         if len(members) > 1:
-            shuffled = members[torch.randperm(len(members), generator=generator)]
-            fold[shuffled] = (torch.arange(len(members)) + offset) % n_folds
+            order = torch.randperm(len(members), generator=generator)
+            fold[members[order]] = (torch.arange(len(members)) + offset) % n_folds
     for number in range(n_folds):
-        if bool((fold == number).any()):
-            yield (fold == number).to(labels.device)
+        is_held_out = fold == number
+        if bool(is_held_out.any()):
+            yield is_held_out.to(labels.device)

@@ -153,16 +153,18 @@ class WhitenedHead(Head):
         own = cosine(queries[:, :n_own], gallery[:, :n_own])
         share = self.prior_share
         length = share.sqrt()  # of the columns by the prior
-        others = self.prior.distances(queries[:, n_own:] / length, gallery[:, n_own:] / length)
+        by_prior = queries[:, n_own:] / length
+        gallery_by_prior = gallery[:, n_own:] / length
+        others = self.prior.distances(by_prior, gallery_by_prior)
         return (1 - share) * own + share * others
 
     def whitened_parts(self, roots: Tensor) -> list[Tensor]:
         """Return the whitened unit vectors (N, cells) of each part, from the square roots (N, D) of histograms."""
         check_cells(roots, len(self.mean))
-        parts = zip(
-            self.parts(roots - self.mean), self.parts(self.directions), self.gains, strict=True
-        )
-        return [functional.normalize(damped(*part), dim=1) for part in parts]
+        centred = self.parts(roots - self.mean)
+        directions = self.parts(self.directions)
+        whitened = map(damped, centred, directions, self.gains)
+        return [functional.normalize(part, dim=1) for part in whitened]
 
     def parts(self, cells: Tensor) -> tuple[Tensor, ...]:
         """Split values (N, D) into a view for each part."""
@@ -255,7 +257,8 @@ class KernelHead(Head):
         medians = distances[:, is_pair].median(dim=1).values
         self.medians = above_zero(medians)
         values, vectors = torch.linalg.eigh(self._kernel(self.anchors).double())
-        factors = torch.where(values > 0, 1 / (values + self.ridge), 0)
+        inverse = 1 / (values + self.ridge)
+        factors = torch.where(values > 0, inverse, 0)
         targets = functional.one_hot(members, len(self.classes)).double()
         # Contiguous as after loading from a file, so that products with them are rounded in the same way.
         solution = vectors * factors @ (vectors.T @ targets)
@@ -284,7 +287,8 @@ class KernelHead(Head):
         return torch.cat([similarity, class_roots], dim=1) / math.sqrt(2)
 
     def _kernel(self, vectors: Tensor) -> Tensor:
-        kernels = (-self._distances(vectors) / self.medians[:, None, None]).exp()
+        relative = self._distances(vectors) / self.medians[:, None, None]
+        kernels = (-relative).exp()
         return torch.einsum("k,kij->ij", self.shares.to(kernels.dtype), kernels)
 
     def _vectors(self, descriptions: Tensor) -> Tensor:

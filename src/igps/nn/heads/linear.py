@@ -104,8 +104,11 @@ class LinearHead(ClassifyingHead):
                 self._fit(columns[~out], labels[~out], strength)
                 members = torch.searchsorted(self.classes, labels[out].to(self.classes))
                 logarithms = self._scores(columns[out]).log_softmax(dim=1)
-                losses[strength] -= float(logarithms.gather(1, members[:, None]).sum())
-        return min(losses, key=losses.__getitem__) if any(losses.values()) else _STRENGTH
+                likelihood = logarithms.gather(1, members[:, None]).sum()
+                losses[strength] -= float(likelihood)
+        if not any(losses.values()):
+            return _STRENGTH
+        return min(losses, key=losses.__getitem__)
 
     def _fit(self, columns: Tensor, labels: Tensor, strength: float) -> Self:
         from sklearn.linear_model import LogisticRegression
@@ -123,7 +126,8 @@ class LinearHead(ClassifyingHead):
             bias = np.concatenate([-bias, bias]) / 2
         self.weights = torch.from_numpy(weights).to(rows).contiguous()
         self.bias = torch.from_numpy(bias).to(rows)
-        self.centres = torch.stack([rows[labels == label].mean(dim=0) for label in self.classes])
+        centres = [rows[labels == label].mean(dim=0) for label in self.classes]
+        self.centres = torch.stack(centres)
         return self
 
     def _directions(self, centred: Tensor) -> Tensor:
@@ -136,7 +140,8 @@ class LinearHead(ClassifyingHead):
             return scales.diag()
         form = centred[:, :n_form]
         directions, _ = principal_directions(form.double(), _N_DIRECTIONS)
-        total = float(form.square().sum(dim=1).mean().sqrt())
+        squares = form.square().sum(dim=1)
+        total = float(squares.mean().sqrt())
         gain = math.sqrt(self.n_numbers) / max(total, 1e-6)
         return torch.block_diag(gain * directions.T.to(centred), scales.diag())
 
@@ -181,4 +186,5 @@ class LinearHead(ClassifyingHead):
         columns = self._columns(descriptions)
         predicted = self._scores(columns).argmax(dim=1)
         rows = self._rows(columns)
-        return (rows - self.centres[predicted]).norm(dim=1) / math.sqrt(rows.shape[1])
+        offsets = rows - self.centres[predicted]
+        return offsets.norm(dim=1) / math.sqrt(rows.shape[1])

@@ -88,7 +88,8 @@ class TwoLevelHead(Head):
             raise ValueError(
                 f"scales: expected a positive scale for each of {n_heads} body heads, got {tuple(scales)}."
             )
-        if len(exponents) != n_heads or min(exponents) <= 0 or not math.isclose(sum(exponents), 1):
+        has_sum = math.isclose(sum(exponents), 1)
+        if len(exponents) != n_heads or min(exponents) <= 0 or not has_sum:
             raise ValueError(
                 f"exponents: expected a positive number for each of {n_heads} body heads, with sum 1, got "
                 f"{tuple(exponents)}."
@@ -131,18 +132,16 @@ class TwoLevelHead(Head):
         for head in self._body_heads():
             head.fit(body_descriptions, bodies, part_cells)
         embeddings = self(descriptions)
-        self.principal = principal_directions(embeddings.double(), MAX_SHORT_WIDTH)[0].to(
-            embeddings.dtype
-        )
+        directions, _ = principal_directions(embeddings.double(), MAX_SHORT_WIDTH)
+        self.principal = directions.to(embeddings.dtype)
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
         """Map histograms (N, ...) to embeddings (N, D) of length 1, with the columns of the body heads last."""
-        classes = (1 - self.share).sqrt() * self.class_head(descriptions)
-        return torch.cat(
-            [classes, *(self._root_share * head(descriptions) for head in self._body_heads())],
-            dim=1,
-        )
+        parts = [(1 - self.share).sqrt() * self.class_head(descriptions)]
+        for head in self._body_heads():
+            parts.append(self._root_share * head(descriptions))
+        return torch.cat(parts, dim=1)
 
     def within_class(self, embeddings: Tensor) -> Tensor:
         """Return the columns of embeddings (N, D) by the body heads.
@@ -185,19 +184,19 @@ class TwoLevelHead(Head):
         lengths = _mean_lengths(query_bodies)[:, None] * _mean_lengths(gallery_bodies)
         exponent = exponent * (lengths / _USUAL_LENGTH**2).pow(_STEEPNESS / 4)
         exponent = exponent + (classes / _SAME_CLASS).pow(_STEEPNESS)
-        differ = torch.expm1(-exponent) * torch.expm1(-(bodies / _SAME_BODY).pow(_STEEPNESS))
-        return (1 - _WEIGHT) * classes * differ - _WEIGHT * torch.expm1(
-            -(bodies / _SAME_BODY).square()
-        )
+        nearness = bodies / _SAME_BODY
+        differ = torch.expm1(-exponent) * torch.expm1(-nearness.pow(_STEEPNESS))
+        alike = torch.expm1(-nearness.square())
+        return (1 - _WEIGHT) * classes * differ - _WEIGHT * alike
 
     def _compared(self, embeddings: Tensor) -> list[Tensor]:
         """Return the `n_compared` columns of embeddings (N, D) by each body head, without its share."""
         heads = self._body_heads()
         parts = self.within_class(embeddings).split([head.n_numbers for head in heads], dim=1)
-        return [
-            part[:, : head.n_compared] / self._root_share
-            for part, head in zip(parts, heads, strict=True)
-        ]
+        compared = []
+        for part, head in zip(parts, heads, strict=True):
+            compared.append(part[:, : head.n_compared] / self._root_share)
+        return compared
 
     def _body_heads(self) -> list[WCCNHead]:
         return [head for head in self.body_heads if isinstance(head, WCCNHead)]
@@ -209,4 +208,5 @@ class TwoLevelHead(Head):
 
 def _mean_lengths(bodies: Sequence[Tensor]) -> Tensor:
     """Return the distances (N,) of shapes from the mean, in quadratic mean over the body heads."""
-    return square_root(torch.stack([x.square().sum(dim=1) for x in bodies]).mean(dim=0))
+    squares = torch.stack([x.square().sum(dim=1) for x in bodies])
+    return square_root(squares.mean(dim=0))

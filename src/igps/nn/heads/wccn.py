@@ -110,8 +110,9 @@ class WCCNHead(Head):
         # Shapes farther from the mean than any training shape are moved onto the sphere.
         lengths = torch.linalg.norm(vectors, dim=1, keepdim=True)
         vectors = vectors / lengths.clamp_min(1)
-        height = (1 - vectors.square().sum(dim=1, keepdim=True)).clamp_min(0)
-        return torch.cat([vectors, square_root(height)], dim=1)
+        squares = vectors.square().sum(dim=1, keepdim=True)
+        height = square_root((1 - squares).clamp_min(0))
+        return torch.cat([vectors, height], dim=1)
 
     @property
     def n_compared(self) -> int:

@@ -151,9 +151,11 @@ class AxesHistogram(SampleHistogram):
 
 def joint(memberships: list[Tensor]) -> Tensor:
     """Return memberships (..., P, C) in all combinations of the classes of several axes."""
-    return reduce(
-        lambda first, second: (first[..., :, None] * second[..., None, :]).flatten(-2), memberships
-    )
+    combined, *others = memberships
+    for other in others:
+        products = combined[..., :, None] * other[..., None, :]
+        combined = products.flatten(-2)
+    return combined
 
 
 def counted(first: Tensor, second: Tensor, n_points: Tensor) -> Tensor:

@@ -59,10 +59,11 @@ class PairHistogram(AxesHistogram):
     ) -> None:
         super().__init__(samples, n_samples, n_training_samples)
         modules = [axis_of(axis) if isinstance(axis, str) else axis for axis in axes]
-        if unknown := [axis for axis in modules if not isinstance(axis, PointAxis | PairAxis)]:
-            raise ValueError(
-                f"axes: expected axes of points or of pairs, got {type(unknown[0]).__name__}."
-            )
+        for axis in modules:
+            if not isinstance(axis, PointAxis | PairAxis):
+                raise ValueError(
+                    f"axes: expected axes of points or of pairs, got {type(axis).__name__}."
+                )
         self.axes = nn.ModuleList(modules)
         if not self.pair_axes:
             raise ValueError(
@@ -74,7 +75,8 @@ class PairHistogram(AxesHistogram):
     def shape(self) -> tuple[int, ...]:
         """The shape of one histogram: the number of pairs of classes, and of bins along each axis of pairs."""
         bins = [n for axis in self.pair_axes for n in axis.shape]
-        return (len(class_pairs(math.prod(axis.n_classes for axis in self.point_axes))), *bins)
+        n_classes = math.prod(axis.n_classes for axis in self.point_axes)
+        return (len(class_pairs(n_classes)), *bins)
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """Return histograms (N, C(C+1)/2, B, ...) of the samples of N shapes."""
@@ -85,11 +87,15 @@ class PairHistogram(AxesHistogram):
         weights = torch.ones_like(classes, dtype=pairs[0].inputs[0].dtype)
         n_classes = 1
         for axis in self.point_axes:
-            axis_classes, axis_weights = axis.members(axis.values(features, self.embedding), mask)
-            classes = (classes.unsqueeze(3) * axis.n_classes + axis_classes.unsqueeze(2)).flatten(2)
-            weights = (weights.unsqueeze(3) * axis_weights.unsqueeze(2)).flatten(2)
+            values = axis.values(features, self.embedding)
+            axis_classes, axis_weights = axis.members(values, mask)
+            combined = classes.unsqueeze(3) * axis.n_classes + axis_classes.unsqueeze(2)
+            products = weights.unsqueeze(3) * axis_weights.unsqueeze(2)
+            classes = combined.flatten(2)
+            weights = products.flatten(2)
             n_classes *= axis.n_classes
-        if (sample_weights := features.weights()) is not None:
+        sample_weights = features.weights()
+        if sample_weights is not None:
             weights = weights * sample_weights.unsqueeze(2)
         return count_pairs(classes, weights, n_classes, pairs, mask)
 
@@ -111,27 +117,30 @@ def joint_histogram(
         ValueError: there are fewer than two points, shapes of tensors do not match, values are not finite, memberships
             are negative or do not sum to 1, or centres do not ascend.
     """
+    if mask is None:
+        mask = torch.ones_like(memberships[..., 0], dtype=torch.bool)
     if memberships.ndim == 2:
-        batched = [replace(pair, inputs=tuple(x[None] for x in pair.inputs)) for pair in pairs]
-        return joint_histogram(memberships[None], batched, None if mask is None else mask[None])[0]
-    mask = torch.ones_like(memberships[..., 0], dtype=torch.bool) if mask is None else mask
+        batched = []
+        for pair in pairs:
+            inputs = tuple(x[None] for x in pair.inputs)
+            batched.append(replace(pair, inputs=inputs))
+        return joint_histogram(memberships[None], batched, mask[None])[0]
     check_pairs(pairs, mask)
     for centres in centres_of(pairs):
-        if (
-            centres.ndim != 1
-            or len(centres) < 2
-            or not bool(((centres.diff() > 0) & centres[1:].isfinite()).all())
-        ):
+        is_row = centres.ndim == 1 and len(centres) > 1
+        if not is_row or not centres.isfinite().all() or not (centres.diff() > 0).all():
             raise ValueError(
                 f"centres: expected two or more finite, ascending values, got {centres.tolist()}."
             )
     real = memberships[mask]
+    errors = (real.sum(dim=1) - 1).abs()
     # Both comparisons are false for NaN.
-    if not bool((real >= 0).all() & ((real.sum(dim=1) - 1).abs() < 1e-3).all()):
+    if not bool((real >= 0).all() & (errors < 1e-3).all()):
         raise ValueError(
             "memberships: expected non-negative rows of sum 1, got others; divide each row by its sum."
         )
-    return count_pairs(*largest_members(memberships, mask), memberships.shape[2], pairs, mask)
+    classes, weights = largest_members(memberships, mask)
+    return count_pairs(classes, weights, memberships.shape[2], pairs, mask)
 
 
 def pair_histogram(
@@ -170,16 +179,16 @@ def pair_histogram(
         raise ValueError(
             f"potential: expected shape ({len(embedding)},), one per point, got {tuple(potential.shape)}."
         )
-    if not bool(((potential >= 0) & torch.isfinite(potential)).all()):
+    is_sound = (potential >= 0) & torch.isfinite(potential)
+    if not bool(is_sound.all()):
         raise ValueError("potential: expected non-negative, finite values, got others.")
     check_at_least(1, n_classes=n_classes)
     check_at_least(2, n_bins=n_bins)
     check_positive(distance_range=distance_range, potential_range=potential_range)
-    classes = (potential * (n_classes / potential_range)).long().clamp_(max=n_classes - 1)
+    classes = (potential * (n_classes / potential_range)).long()
+    classes = classes.clamp(max=n_classes - 1)
     dtype = torch.promote_types(embedding.dtype, torch.float32)
-    centres = (torch.arange(n_bins, dtype=dtype, device=embedding.device) + 0.5) * (
-        distance_range / n_bins
-    )
-    return joint_histogram(
-        one_hot(classes, n_classes).to(dtype), [euclidean_distances(embedding, centres)]
-    )
+    numbers = torch.arange(n_bins, dtype=dtype, device=embedding.device)
+    centres = (numbers + 0.5) * (distance_range / n_bins)
+    memberships = one_hot(classes, n_classes).to(dtype)
+    return joint_histogram(memberships, [euclidean_distances(embedding, centres)])

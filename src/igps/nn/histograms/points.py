@@ -85,4 +85,5 @@ def point_histogram(
     other_classes = joint([torch.ones_like(first[..., :1]), *others])
     counts = mask if weights is None else mask * weights
     shares = counted(first * counts.unsqueeze(2), other_classes, mask.sum(dim=1))
-    return shares.view(mask.shape[0], *(x.shape[-1] for x in memberships))
+    n_classes = [x.shape[-1] for x in memberships]
+    return shares.view(mask.shape[0], *n_classes)
