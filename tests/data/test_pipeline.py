@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from bodies_on_disk import write_body
 from igps.data import keys
@@ -12,7 +13,7 @@ from igps.data.cache_hit import CacheHit
 from igps.data.pipeline import SignaturePipeline
 from igps.failures import Failed
 from igps.mesh.errors import MeshError
-from igps.mesh.loading import BodyRef
+from igps.mesh.loading import BodyRef, load_mesh
 from igps.mesh.mending import MENDING_VERSION
 from igps.mesh.options import LoadOptions
 from igps.signature.measures import MEASURES_VERSION, measures
@@ -117,8 +118,7 @@ def test_plain_numbers_are_computed_where_they_are_asked_for_and_once(pipeline, 
     assert pipeline.signature(BodyRef(path)).measures == {}
     asking = replace(pipeline, config=replace(CONFIG, measures=True))
     assert not is_cached(asking, BodyRef(path))
-    points = pipeline.signature(BodyRef(path)).interior.points
-    numbers = measures(pipeline.mesh(BodyRef(path)), points)
+    numbers = measures(pipeline.mesh(BodyRef(path)))
     expected = pytest.approx(numbers, rel=1e-9, abs=1e-9)
     stored = pipeline.cache("signature").path(without.key)
     written = stored.stat().st_mtime_ns
@@ -134,6 +134,31 @@ def test_plain_numbers_are_computed_where_they_are_asked_for_and_once(pipeline, 
     file.write_bytes(file.read_bytes()[:-1])
     assert not is_cached(asking, BodyRef(path))
     assert asking.signature(BodyRef(path)).measures == expected
+
+
+@pytest.mark.parametrize("shape", ["egg", "box"])
+def test_a_body_has_one_record_of_plain_numbers_whatever_the_configuration(
+    pipeline, path, monkeypatch, shape
+):
+    if shape == "box":  # which is subdivided for eigenpairs
+        trimesh.creation.box((1, 2, 3)).export(path)
+    body = BodyRef(path)
+    expected = measures(load_mesh(path))
+    configs = [
+        SignatureConfig(n_eigenpairs=0, n_surface_samples=20),
+        SignatureConfig(n_eigenpairs=20, n_surface_samples=30, seed=1),
+        replace(CONFIG, max_vertices=30),
+    ]
+    for n, config in enumerate(configs):
+        cache_dir = pipeline.cache_dir.with_name(f"cache {n}")
+        alone = replace(pipeline, config=replace(config, measures=True), cache_dir=cache_dir)
+        assert alone.signature(body).measures == expected
+        in_memory = replace(alone, meshes={body: load_mesh(path)})
+        assert in_memory.signature(body).measures == expected
+    monkeypatch.delattr("igps.data.pipeline.measures")
+    for config in configs:
+        reader = replace(alone, config=replace(config, measures=True))
+        assert reader.signature(body).measures == expected
 
 
 def test_another_version_makes_other_keys(pipeline, path, monkeypatch):

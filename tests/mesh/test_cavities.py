@@ -20,6 +20,7 @@ from igps import (
 )
 from igps.descriptors.interior import interior
 from igps.fields.volumes.label_surface import voxel_surface
+from igps.mesh.loading import refined
 from igps.mesh.mending import mend, repair_steps
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import signed_volume
@@ -174,7 +175,7 @@ def test_the_outer_surface_has_vertices_enough_whatever_the_cavity_has():
         (np.asarray(box.vertices), np.asarray(box.faces)),
         ball(1, inwards=True),
     )
-    hollow = mend(*surface, least_vertices=100, cavities="keep")
+    hollow = refined(mend(*surface, cavities="keep"), LoadOptions(), 100)
     assert hollow.outer()[1].sum() >= 100
     assert hollow.volume == pytest.approx(64 - BALL.volume, rel=1e-9)
     assert simplify(hollow, 700).cavities

@@ -12,8 +12,10 @@ from trimesh.creation import icosphere
 
 from conftest import tube
 from igps.mesh.errors import MeshError
+from igps.mesh.loading import refined
 from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh
+from igps.mesh.options import LoadOptions
 from igps.mesh.simplification import subdivide
 from igps.mesh.surface import area_vectors
 from igps.mesh.watertight import watertight
@@ -139,7 +141,7 @@ def test_a_part_that_sticks_out_is_not_hidden():
 
 
 def test_too_few_vertices_are_more_on_the_same_surface():
-    mesh = mend(box().vertices, box().faces, least_vertices=52)
+    mesh = refined(box(), LoadOptions(), 52)
     assert repair_steps(mesh.notes) == ("subdivided",)
     assert len(mesh.vertices) >= 52
     assert mesh.volume == pytest.approx(6, rel=1e-12)

@@ -152,7 +152,7 @@ def _finding(ref: BodyRef, raw: RawBody, pipeline: SignaturePipeline, start: flo
         except MeshError as error:
             finding = replace(finding, fault=str(error))
     try:
-        mesh = surface_body(raw, ref, reading, least_vertices=config.n_vertices_read)
+        mesh = pipeline.refined(surface_body(raw, ref, reading))
     except MeshError as error:
         return _refused(finding, error)
     n_simplified = min(len(mesh.vertices), config.max_vertices or len(mesh.vertices))

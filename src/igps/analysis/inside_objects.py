@@ -13,6 +13,7 @@ from igps.data.attribute_sources import fill_missing
 from igps.data.grids import Grid, grid_of
 from igps.data.in_memory import bodies_in_memory
 from igps.mesh.errors import MeshError
+from igps.mesh.loading import refined
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig, compute_signature
@@ -61,7 +62,7 @@ def inside(image: Any, label: Any, spacing: Sequence[float] | None = None) -> li
     _check_same_place(images, labels)
     config = inside_config(SignatureConfig())
     volume = (labels.values, tuple(_sides_of_voxel(labels).tolist()))
-    bodies, meshes = bodies_in_memory({"label": volume}, None, LoadOptions(), config)
+    bodies, meshes = bodies_in_memory({"label": volume}, None, LoadOptions())
     rows: list[dict[str, Any]] = []
     errors: list[MeshError] = []
     for part, mesh in zip(bodies.parts, meshes.values(), strict=True):
@@ -107,7 +108,8 @@ def _numbers(
     """Return the numbers of a body, whose mesh lies along the axes of the labels, from the first voxel."""
     if isinstance(mesh, MeshError):
         raise mesh
-    signature = compute_signature(mesh, config)
+    finer = refined(mesh, LoadOptions(), config.n_vertices_read)
+    signature = compute_signature(finer, config)
     places = labels.to_world(signature.interior.points / _sides_of_voxel(labels))
     values = {}
     for name, grid in images.items():

@@ -270,9 +270,7 @@ def _measure(
     """Return the measures `_MEASURED` of a body, and the place of a label."""
     values = dict.fromkeys(_MEASURED, np.nan)
     if raw.voxels is None:
-        least_vertices = pipeline.config.n_vertices_read
-        made = raw.made()
-        mesh = surface_body(made, body, pipeline.reading, least_vertices=least_vertices)
+        mesh = pipeline.refined(surface_body(raw.made(), body, pipeline.reading))
         length = millimetres(mesh.unit)
         values["volume"] = np.log(mesh.volume * length**3)
         values["spacing"] = np.log(mesh.area * length**2 / len(mesh.faces)) / 2

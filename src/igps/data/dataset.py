@@ -103,7 +103,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         sources, self._functions = split_attributes(attributes)
         meshes: Mapping[BodyRef, Mesh | MeshError] = {}
         if isinstance(root_or_paths, Mapping):
-            root_or_paths, meshes = bodies_in_memory(root_or_paths, labels, reading, config)
+            root_or_paths, meshes = bodies_in_memory(root_or_paths, labels, reading)
             labels = None  # of objects; those of bodies are known
         directory = Path(cache_dir or default_cache_dir())
         bodies = bodies_of(root_or_paths, labels, reading, sources.values(), directory)

@@ -10,14 +10,12 @@ from igps.mesh.loading import BodyRef, surface_body
 from igps.mesh.mesh import Mesh
 from igps.mesh.objects import object_bodies
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import SignatureConfig
 
 
 def bodies_in_memory(
     objects: Mapping[str, Any],
     labels: Sequence[str] | None,
     options: LoadOptions,
-    config: SignatureConfig,
 ) -> tuple[Bodies, dict[BodyRef, Mesh | MeshError]]:
     """Return the bodies of objects by name, see `object_bodies`, and the mesh or the error of each body."""
     if labels is not None and len(labels) != len(objects):
@@ -26,7 +24,6 @@ def bodies_in_memory(
         )
     if not objects:
         raise ValueError("bodies: expected at least one, got none.")
-    min_vertices = config.resolved().n_vertices_read
     meshes: dict[BodyRef, Mesh | MeshError] = {}
     classes: list[str] = []
     for i, (name, value) in enumerate(objects.items()):
@@ -35,9 +32,7 @@ def bodies_in_memory(
             for raw in object_bodies(value, name, options):
                 ref = BodyRef(Path(name), raw.part)
                 try:
-                    meshes[ref] = surface_body(
-                        raw.made(), ref, options, least_vertices=min_vertices
-                    )
+                    meshes[ref] = surface_body(raw.made(), ref, options)
                 except MeshError as error:
                     meshes[ref] = error
         except MeshError as error:

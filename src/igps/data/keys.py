@@ -2,8 +2,8 @@
 
 The key of a Signature is the hash of everything that it depends on: the content of its files, the number of a label or
 the name of another body, the load options, the configuration, and the versions of mending and of the algorithm. What is
-made from a Signature (its plain numbers, an attribute, a transformed Signature, a description) has the hash of that key
-and of its own parameters as key, see `derived_key`.
+made from a Signature (an attribute, a transformed Signature, a description) has the hash of that key and of its own
+parameters as key, see `derived_key`. Plain numbers are made from the surface, whose key has no configuration.
 """
 
 import hashlib
@@ -69,7 +69,7 @@ def signature_key(
 
 
 def derived_key(kind: str, key: str, *parameters: object) -> str:
-    """Return the key of what is made from a Signature: of the kind, the Signature's key, and the parameters."""
+    """Return the key of what is made from a Signature or surface: of the kind, its key, and the parameters."""
     return _hash(json.dumps([kind, key, *parameters]).encode()).hex()
 
 

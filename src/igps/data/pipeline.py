@@ -23,7 +23,7 @@ from igps.data.surfaces import known_surface, surface_record
 from igps.failures import Failed, MachineError, attempt
 from igps.mesh.errors import MeshError
 from igps.mesh.formats import dependencies_of, names_of
-from igps.mesh.loading import BodyRef, each_surface, read_surface, surface_body
+from igps.mesh.loading import BodyRef, each_surface, read_surface, refined, surface_body
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.mesh.raw_body import RawBody
@@ -75,9 +75,18 @@ class SignaturePipeline:
         """Return the cache of a kind of records."""
         return Cache(self.cache_dir, kind)
 
+    def mesh(self, body: BodyRef) -> Mesh:
+        """Return the checked mesh of a body, as for its Signature; raise a MeshError if it cannot be used."""
+        return self.refined(self._read(body))
+
     @one_thread()
-    def mesh(self, body: BodyRef, content: Content | None = None) -> Mesh:
-        """Return the checked mesh of a body; raise a MeshError if it cannot be used."""
+    def refined(self, mesh: Mesh) -> Mesh:
+        """Return a mesh that was read with as many vertices as the configuration requires."""
+        return refined(mesh, self.reading, self.config.n_vertices_read)
+
+    @one_thread()
+    def _read(self, body: BodyRef, content: Content | None = None) -> Mesh:
+        """Return the mesh of a body as it was read and mended, whatever the configuration."""
         if body in self.meshes:
             mesh = self.meshes[body]
             if isinstance(mesh, MeshError):
@@ -92,8 +101,7 @@ class SignaturePipeline:
 
     @one_thread()
     def _body(self, raw: RawBody, body: BodyRef) -> Mesh:
-        least_vertices = self.config.n_vertices_read
-        return surface_body(raw, body, self.reading, least_vertices=least_vertices)
+        return surface_body(raw, body, self.reading)
 
     def _surfaces(
         self, bodies: Iterable[BodyRef], content: Content
@@ -127,7 +135,7 @@ class SignaturePipeline:
     def content(self, body: BodyRef, known: Mapping[Path, bytes] | None = None) -> Content:
         """Return the content of a body, with the digests of files that are known; raise a MeshError if unreadable."""
         if body in self.meshes:
-            return Content.of_mesh(self.mesh(body))
+            return Content.of_mesh(self._read(body))
         known = known or {}
         try:
             paths = dependencies_of(body.path, self.reading)
@@ -276,14 +284,16 @@ class SignaturePipeline:
             return replace(signature, measures=numbers)
         config = None  # on which reading does not depend
         try:
-            mesh = self.mesh(body, content) if mesh is None else mesh
+            mesh = self._read(body, content) if mesh is None else mesh
             config = self.config
+            finer = self.refined(mesh)
             if signature is None:
-                signature = compute_signature(mesh, replace(config, measures=False))
+                signature = compute_signature(finer, replace(config, measures=False))
                 self.put("signature", key, encode(signature))
             if numbers is None:
-                numbered = mesh.numbered_by_faces()  # on which rounding depends
-                numbers = measures(numbered, signature.interior.points)
+                has_usual_points = config.has_usual_samples and finer is mesh
+                points = signature.interior.points if has_usual_points else None
+                numbers = measures(mesh, points)
                 texts = {"measures": json.dumps(numbers)}
                 self.put("measure", self._measures_key(body, content), Record({}, texts))
         except MeshError as error:
@@ -299,8 +309,8 @@ class SignaturePipeline:
         return self.cache("measure").get(key, lambda record: json.loads(record.texts["measures"]))
 
     def _measures_key(self, body: BodyRef, content: Content) -> str:
-        key = signature_key(content, body, self.reading, self.config)
-        return derived_key("measure", key, MEASURES_VERSION)
+        surface = signature_key(content, body, self.reading, None)
+        return derived_key("measure", surface, MEASURES_VERSION)
 
     def _attribute(
         self, body: BodyRef, signature: Signature, name: str, key: str

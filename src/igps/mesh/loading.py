@@ -20,11 +20,16 @@ from igps.mesh.mending import mend
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.raw_body import RawBody, joined, pieces
+from igps.mesh.simplification import subdivide
 from igps.mesh.surface import compact, diagonal, face_areas
 
 logger = logging.getLogger(__name__)
 
 _COARSE = 0.004  # rounding step of coordinates, over the size of the body, that changes eigenvalues by about 1 %
+
+# A mesh with too few vertices is subdivided to this multiple of the minimum: with just enough vertices the last
+# eigenfunctions would depend on the triangles.
+_SUBDIVISION_FACTOR = 4
 
 _MAX_LOST = 0.01  # largest share of faces that may be dropped because a vertex has no coordinates
 
@@ -85,7 +90,8 @@ def load_mesh(
     """
     raw = read_surface(path, options, part=part)
     ref = BodyRef(Path(path), raw.part)
-    return surface_body(raw, ref, options, least_vertices=least_vertices)
+    mesh = surface_body(raw, ref, options)
+    return refined(mesh, options, least_vertices)
 
 
 def load_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[Mesh]:
@@ -108,15 +114,12 @@ def each_body(
     options: LoadOptions = LoadOptions(),
     *,
     parts: Sequence[str | None] | None = None,
-    least_vertices: int = 0,
 ) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:
     """Iterate over the bodies of a file, or over the given parts; the MeshError of an unusable body takes its place."""
     for ref, raw in each_surface(path, options, parts=parts):
         with one_thread():
             try:
-                body: Mesh | MeshError = surface_body(
-                    raw, ref, options, least_vertices=least_vertices
-                )
+                body: Mesh | MeshError = surface_body(raw, ref, options)
             except MeshError as error:
                 body = error
         yield ref, body
@@ -177,9 +180,7 @@ def read_surface(
     raise MeshError(f"{path}: has no body {part!r}; there are: {shown}. Choose one of them.")
 
 
-def surface_body(
-    raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0
-) -> Mesh:
+def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions()) -> Mesh:
     """Make a body of a surface, see `load_mesh`; a MeshError if the surface is not usable."""
     if raw.fault is not None:
         raise raw.fault
@@ -202,7 +203,6 @@ def surface_body(
         vertices,
         faces,
         how=options.mend,
-        least_vertices=least_vertices,
         normals=raw.normals,
         cavities=options.cavities,
         denoise=raw.denoise,
@@ -215,6 +215,18 @@ def surface_body(
     return mesh.annotated(
         notes=notes, unit=raw.unit, frame=raw.frame, fine_area=fine_area, given=raw.given
     )
+
+
+def refined(mesh: Mesh, options: LoadOptions, least_vertices: int) -> Mesh:
+    """Subdivide a body of too few vertices for its eigenpairs, longest edges first; see `load_mesh`."""
+    if options.mend == "never" or mesh.allow_open:
+        return mesh
+    _, is_outer = mesh.outer()
+    n_outer = int(is_outer.sum())
+    if n_outer >= least_vertices:
+        return mesh
+    n_inner = len(mesh.vertices) - n_outer
+    return subdivide(mesh, _SUBDIVISION_FACTOR * least_vertices + n_inner)
 
 
 def _with_coordinates(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, list[str]]:

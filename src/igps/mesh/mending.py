@@ -1,4 +1,4 @@
-"""Make a body of a surface by as few repairs as possible: weld, fill, unite, smooth, subdivide, or make watertight.
+"""Make a body of a surface by as few repairs as possible: weld, fill, unite, smooth, or make watertight.
 
 A mesh that is a body already and not noisy is returned bit for bit. Every repair is recorded in the notes of the mesh,
 and `repair_steps` returns the repairs that notes record.
@@ -27,7 +27,6 @@ from igps.mesh.denoising import is_noisy, remove_noise
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh, check_arrays, check_coordinates, check_size
 from igps.mesh.options import Cavities, Mending
-from igps.mesh.simplification import subdivide
 from igps.mesh.surface import signed_volume
 from igps.mesh.watertight import crosses_itself, watertight
 
@@ -41,9 +40,6 @@ MENDING_VERSION = 12
 # Steps by the first words of their notes
 _STARTS: dict[str, Step] = {step: step for step in get_args(Step)}
 _STARTS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
-# A mesh with too few vertices is subdivided to this multiple of the minimum: with just enough vertices the last
-# eigenfunctions would depend on the triangles.
-_SUBDIVISION_FACTOR = 4
 
 # A shell is named open if this share of its surface is missing, and it has less than this share of
 # the volume within.
@@ -56,7 +52,6 @@ def mend(
     faces: Integers | None,
     *,
     how: Mending = "auto",
-    least_vertices: int = 0,
     normals: Floats | None = None,
     cavities: Cavities = "fill",
     denoise: bool = True,
@@ -67,14 +62,13 @@ def mend(
     Repairs are made in this order, until the surface is a body: weld coincident vertices, drop degenerate and duplicate
     faces, and orient the faces; drop fins and specks; fill small holes; drop closed parts inside the body; unite
     overlapping closed parts; make it `watertight`. A body that is rough with scanner noise is smoothed, because noise
-    adds area. A body of fewer than `least_vertices` vertices is subdivided, longest edges first.
+    adds area.
 
     Args:
         vertices: (V, 3) positions, any length unit.
         faces: (F, 3) vertex indices; None or empty for a point cloud, which is made watertight.
         how: "auto": as above. "never": accept bodies only. "always": make every surface watertight that, after welding,
             does not bound one body or intersects itself; "auto" does not check for intersections.
-        least_vertices: minimal number of vertices, such as the number of eigenpairs plus two; ignored with "never".
         normals: (V, 3) normals of a point cloud, if known.
         cavities: "fill" drops closed parts inside the body. "keep" makes them the surfaces of hollows, unless the body
             is made watertight.
@@ -113,11 +107,6 @@ def mend(
         mending = _Mending(name, cavities == "keep", denoise)
         repair = mending.remade if how == "always" else mending.mended
         mesh = repair(vertices, triangles)
-    _, is_outer = mesh.outer()
-    n_outer = int(is_outer.sum())
-    if n_outer < least_vertices:
-        n_inner = len(mesh.vertices) - n_outer
-        mesh = subdivide(mesh, _SUBDIVISION_FACTOR * least_vertices + n_inner)
     for note in mesh.notes:
         logger.info("%s: %s", name, note)
     return mesh

@@ -92,6 +92,13 @@ class SignatureConfig:
         return self.DEFAULT_EIGENPAIRS if self.n_eigenpairs is None else self.n_eigenpairs
 
     @property
+    def has_usual_samples(self) -> bool:
+        """Whether the samples inside a body are those of the default configuration."""
+        usual = SignatureConfig()
+        grid = (self.resolution, self.min_samples, self.max_vertices)
+        return grid == (usual.resolution, usual.min_samples, usual.max_vertices)
+
+    @property
     def n_vertices_read(self) -> int:
         """`least_vertices`, or the fewest that the eigenpairs require if None."""
         return self.n_kept + 2 if self.least_vertices is None else self.least_vertices

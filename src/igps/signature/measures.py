@@ -17,6 +17,7 @@ from igps._threads import one_thread
 from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors, components, directed_edges, undirected_edges
+from igps.signature.config import SignatureConfig
 from igps.signature.voxels import interior_samples
 
 MEASURES_VERSION = 8
@@ -55,6 +56,7 @@ POWERS: Mapping[str, int] = {
 # of these widths is within 0.4 % of the largest diameter, which the steps after them find.
 _N_DIRECTIONS = 250
 _N_DIAMETER_STEPS = 3
+_USUAL = SignatureConfig()
 # Interior points at which the thickness is measured, and the largest number of steps by which balls grow there; most
 # need eight. A step of less than a hundredth of the radius is the last.
 _N_THICKNESS_POINTS = 400
@@ -105,11 +107,14 @@ def measures(mesh: Mesh, points: Floats | None = None) -> dict[str, float]:
 
     Args:
         mesh: the body.
-        points: (P, 3) points evenly inside the body, such as those of its Signature; found if None.
+        points: (P, 3) its `interior_samples` by the default configuration, if known; found if None.
 
     Raises:
         MeshError: no points were found inside the body.
     """
+    mesh = mesh.numbered_by_faces()  # rounding depends on the numbering
+    if points is None:
+        points = interior_samples(mesh, _USUAL.resolution, _USUAL.min_samples)
     volume = mesh.volume
     area = mesh.area
     hull = ConvexHull(mesh.vertices)
@@ -117,8 +122,6 @@ def measures(mesh: Mesh, points: Floats | None = None) -> dict[str, float]:
     centroid, variances, axes = _moments(mesh)
     least, minor, major = 4 * np.sqrt(variances)
     box = np.ptp(corners @ axes, axis=0).prod()
-    if points is None:
-        points = interior_samples(mesh, min_samples=_N_THICKNESS_POINTS)
     thickness = local_thickness(mesh, points)
     edges, edge_of = undirected_edges(mesh.faces)
     total_curvature = _total_mean_curvature(mesh, edge_of)

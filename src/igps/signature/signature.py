@@ -191,7 +191,8 @@ def compute_signature(
             f"{len(outer.vertices)}. Subdivide the mesh or lower n_eigenpairs."
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
-    numbers = measures(whole, points) if config.measures else {}
+    usual_points = points if config.has_usual_samples else None
+    numbers = measures(whole, usual_points) if config.measures else {}
     if config.n_kept == 0:
         return _without_eigenpairs(mesh, points, config, numbers)
     spectrum, notes = _spectrum(outer, config)
