@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from igps.cli.shared_options import Size
 if TYPE_CHECKING:
     from igps.analysis.groups import GroupTest
     from igps.cli.reading import Described
+    from igps.data.dataset import SignatureDataset
     from igps.data.sources import Bodies
 
 _N_NUMBERS = 10  # of `igps groups --inside`, those that are printed
@@ -49,15 +51,11 @@ def groups(
         n_permutations: number of random permutations.
         seed: seed of the permutations, bootstraps and folds.
     """
-    import numpy as np
-
     from igps._progress import Progress
     from igps.analysis.groups import group_test, with_q_values
     from igps.cli.inside_command import check_has_attribute, inside_vectors
     from igps.cli.reading import Folder, described
     from igps.descriptors import descriptor as descriptor_of
-    from igps.descriptors.size_and_side import keeps_size
-    from igps.mesh.mesh import millimetres
     from igps.report.figures import LEVEL, groups_figure, write_analysis
     from igps.report.tables import groups_table
 
@@ -66,15 +64,7 @@ def groups(
     if inside:
         check_has_attribute(reading)
 
-    def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
-        labels = np.array(bodies.labels if group is None else bodies.column(group))
-        stratum = None if strata is None else np.array(bodies.column(strata))
-        return (
-            labels,
-            stratum,
-            np.hstack([_design(bodies, name) for name in covariate]) if covariate else None,
-        )
-
+    columns = partial(_columns, group=group, strata=strata, covariate=covariate)
     folder = Folder(root, labelled=group is None, check=columns)
     # Size counts only where the descriptor's name says so
     size_option: Size = "ignore" if "scale" in descriptor_of(descriptor).invariant_to else "auto"
@@ -83,17 +73,12 @@ def groups(
     labels, stratum, covariates = columns(bodies)
     vectors = {"": result.coordinates(within_class=True)}
     if test_size:
-        if warning := keeps_size("keep", result.dataset.units())[1]:
-            print(warning)
-        vectors[", size"] = np.log(
-            [[s.volume * millimetres(s.unit) ** 3] for s in result.dataset.signatures()]
-        )
+        vectors[", size"] = _log_volumes(result.dataset)
     members = _members(bodies, labels)
-    jobs = [
-        (body + suffix, i, rows[i])
-        for body, i in members.items()
-        for suffix, rows in vectors.items()
-    ]
+    jobs = []
+    for body, own in members.items():
+        for suffix, of_bodies in vectors.items():
+            jobs.append((body + suffix, own, of_bodies[own]))
     by_number: list[tuple[str, list[int], Any]] = []
     if inside:
         whole, by_number = inside_vectors(folder, bodies, members, **reading)
@@ -101,15 +86,15 @@ def groups(
 
     def tested(jobs: list[tuple[str, list[int], Any]]) -> list[GroupTest]:
         found = []
-        for body, i, rows in Progress(jobs, desc="tests"):
+        for body, own, rows in Progress(jobs, desc="tests"):
             test = group_test(
                 rows,
-                labels[i].tolist(),
+                labels[own].tolist(),
                 body=body,
                 n_permutations=n_permutations,
                 seed=seed,
-                strata=None if stratum is None else stratum[i].tolist(),
-                covariates=None if covariates is None else covariates[i],
+                strata=None if stratum is None else stratum[own].tolist(),
+                covariates=None if covariates is None else covariates[own],
             )
             found.append(test)
         return with_q_values(found)
@@ -137,6 +122,36 @@ def groups(
     return [asdict(test) for test in [*tests, *numbers]]
 
 
+def _columns(
+    bodies: Bodies, group: str | None, strata: str | None, covariate: list[str] | None
+) -> tuple[Any, Any, Any]:
+    """Return the groups (N,), the strata (N,) and the covariates (N, k) of bodies by columns of labels.csv, or None."""
+    import numpy as np
+
+    labels = np.array(bodies.labels if group is None else bodies.column(group))
+    stratum = None if strata is None else np.array(bodies.column(strata))
+    covariates = None
+    if covariate:
+        covariates = np.hstack([_design(bodies, name) for name in covariate])
+    return labels, stratum, covariates
+
+
+def _log_volumes(dataset: SignatureDataset) -> Any:
+    """Return the logarithms (N, 1) of volumes, in mm³; print a warning if a unit is not known."""
+    import numpy as np
+
+    from igps.descriptors.size_and_side import keeps_size
+    from igps.mesh.mesh import millimetres
+
+    _, warning = keeps_size("keep", dataset.units())
+    if warning:
+        print(warning)
+    volumes = []
+    for signature in dataset.signatures():
+        volumes.append(signature.volume * millimetres(signature.unit) ** 3)
+    return np.log(volumes)[:, None]
+
+
 def _members(bodies: Bodies, labels: Any) -> dict[str, list[int]]:
     """Return the indices of the bodies of each kind, such as an organ; "all" if the parts are no kinds."""
     from igps.cli.reading import is_named_after_file
@@ -145,12 +160,12 @@ def _members(bodies: Bodies, labels: Any) -> dict[str, list[int]]:
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)
     n_pairs = len(set(zip(bodies.parts, labels, strict=True)))
-    is_named_by_file = n_pairs == len(bodies) and all(
-        map(is_named_after_file, bodies.names, bodies.parts)
-    )
-    if is_named_by_file or n_pairs == len(members) in (len(set(labels)), len(bodies)):
-        # The parts are not organs: they are the groups, or the names of files with one mask each, which may repeat in
-        # each group
+    are_named_by_file = all(map(is_named_after_file, bodies.names, bodies.parts))
+    # The parts are not organs: they are the names of files with one mask each, which may repeat in each group
+    are_files = n_pairs == len(bodies) and are_named_by_file
+    # or they are the groups
+    are_groups = n_pairs == len(members) and len(members) in (len(set(labels)), len(bodies))
+    if are_files or are_groups:
         return {"all": list(range(len(bodies)))}
     return members
 
@@ -190,6 +205,5 @@ def _design(bodies: Bodies, name: str) -> Any:
     words = bodies.column(name)
     if any(re.match(r"[-+.\d]|inf(inity)?$", word, re.IGNORECASE) for word in words):
         return np.array(bodies.numbers(name))[:, None]
-    return np.array(
-        [[word == category for category in sorted(set(words))] for word in words], dtype=float
-    )
+    categories = np.array(sorted(set(words)))
+    return (np.array(words)[:, None] == categories).astype(float)

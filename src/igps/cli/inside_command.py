@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,8 +38,10 @@ def inside(meshes: list[Path], out: Path | None = None, **reading: Any) -> list[
     dataset, table, failures = inside_bodies(files_or_folder(meshes), **reading)
     rows = []
     for name, numbers in zip(dataset.bodies.names, table.rows.tolist(), strict=True):
-        defined = (None if number != number else number for number in numbers)
-        rows.append({"name": name, **dict(zip(table.columns, defined, strict=True))})
+        row: dict[str, Any] = {"name": name}
+        for column, number in zip(table.columns, numbers, strict=True):
+            row[column] = None if math.isnan(number) else number
+        rows.append(row)
     if out is not None:
         metadata, measured = feature_table(dataset, table.rows[:, :0], [])
         columns = {name: [row[name] for row in rows] for name in table.columns}
@@ -111,10 +114,12 @@ def inside_vectors(
         own = [i for i in indices if bodies.names[i] in row_of]
         part = table.subset([row_of[bodies.names[i]] for i in own])
         is_whole, scores = part.scores()
-        whole.append((f"{kind}, inside", list(compress(own, is_whole)), scores))
+        complete = list(compress(own, is_whole))
+        whole.append((f"{kind}, inside", complete, scores))
         for name in table.columns:
             is_known, numbers = part.known(name)
-            by_number.append((f"{kind}, {name}", list(compress(own, is_known)), numbers))
+            known = list(compress(own, is_known))
+            by_number.append((f"{kind}, {name}", known, numbers))
     return whole, by_number
 
 

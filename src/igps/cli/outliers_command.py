@@ -53,28 +53,29 @@ def outliers(
     ranked = find_outliers(
         distances, dataset.bodies.labels or (), measures, dataset.all_notes(), subjects, sides
     )
-    rows: list[dict[str, Any]] = [
-        {
-            "name": dataset.bodies.names[o.body],
-            "class": o.label,
-            "score": round(o.score, 3),
-            "reason": o.reason,
-            **{f"score_{name}": round(value, 3) for name, value in o.scores.items()},
+    names = dataset.bodies.names
+    rows: list[dict[str, Any]] = []
+    for one in ranked:
+        row = {
+            "name": names[one.body],
+            "class": one.label,
+            "score": round(one.score, 3),
+            "reason": one.reason,
         }
-        for o in ranked
-    ]
-    cells = [
-        (f"{row['score']:.1f}", row["name"], f"{row['class']}: {row['reason']}")
-        for row in rows[:top]
-    ]
+        for name, value in one.scores.items():
+            row[f"score_{name}"] = round(value, 3)
+        rows.append(row)
+    cells = []
+    for row in rows[:top]:
+        reason = f"{row['class']}: {row['reason']}"
+        cells.append((f"{row['score']:.1f}", row["name"], reason))
     print(text_table(("score", "body", "class: reason"), cells, left=("body", "class: reason")))
-    print(
-        f"{sum(o.is_outlier for o in ranked)} of {len(rows)} bodies are outliers, with a score above {LIMIT}"
-    )
+    n_outliers = sum(one.is_outlier for one in ranked)
+    print(f"{n_outliers} of {len(rows)} bodies are outliers, with a score above {LIMIT}")
     if out is not None:
-        pictured = [
-            (o, dataset.bodies.names[o.body], dataset.mesh(o.body)) for o in ranked[: min(top, 12)]
-        ]
+        pictured = []
+        for one in ranked[: min(top, 12)]:
+            pictured.append((one, names[one.body], dataset.mesh(one.body)))
         write_analysis(out, "outliers", rows, outliers_figure(pictured) if pictured else None)
         print(f"written to {out}")
     return rows

@@ -262,13 +262,14 @@ def print_reading_warning(descriptor: Descriptor, dataset: SignatureDataset) -> 
     fitted = descriptor.card.get("reading")
     if not isinstance(fitted, Mapping):  # not a fitted model, or its card is of an earlier version
         return
-    then, now = (
-        {**asdict(LoadOptions()), **options} for options in (fitted, dataset.reading.as_dict())
-    )
-    names = ("mend", "allow_open", "cavities")
-    if changed := [
-        f"--{name} {then[name]}, not {now[name]}" for name in names if then[name] != now[name]
-    ]:
+    defaults = asdict(LoadOptions())
+    then = {**defaults, **fitted}
+    now = {**defaults, **dataset.reading.as_dict()}
+    changed = []
+    for name in ("mend", "allow_open", "cavities"):
+        if then[name] != now[name]:
+            changed.append(f"--{name} {then[name]}, not {now[name]}")
+    if changed:
         print(
             f"{descriptor.name} was fitted to bodies read with {', '.join(changed)}: its results may be wrong"
         )

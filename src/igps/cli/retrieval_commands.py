@@ -243,8 +243,9 @@ def query(
     if is_gallery(gallery):
         opened = Gallery(gallery, descriptor)
         number_bars(2)
-        description = _describe_body(mesh, opened.descriptor, **gallery_options(opened, describing))
-        matches = opened.nearest(description, top=top, rerank=rerank, where=where, exact=exact)[0]
+        options = gallery_options(opened, describing)
+        description = _describe_body(mesh, opened.descriptor, **options)
+        (matches,) = opened.nearest(description, top=top, rerank=rerank, where=where, exact=exact)
         n_missing = sum(not match.path.exists() for match in matches)
         nearest = [(match.name, match.label, match.distance) for match in matches]
     elif where is not None:
@@ -270,17 +271,16 @@ def query(
         distances = ranking.distances[0]
         if rerank:
             distances = rerank_candidates(description, known.descriptions[indices], distance)
-        nearest_first = distances.argsort(stable=True)[:top]
-        pairs = zip(indices[nearest_first].tolist(), distances[nearest_first].tolist(), strict=True)
         labels = bodies.labels or [None] * len(bodies)
-        nearest = [(bodies.names[i], labels[i], value) for i, value in pairs]
-    rows: list[dict[str, Any]] = [
-        {"rank": place, "distance": value, "name": name, "class": label}
-        for place, (name, label, value) in enumerate(nearest, 1)
-    ]
-    cells = [
-        (row["rank"], f"{row['distance']:.3g}", row["name"], row["class"] or "-") for row in rows
-    ]
+        nearest = []
+        for place in distances.argsort(stable=True)[:top].tolist():
+            i = int(indices[place])
+            nearest.append((bodies.names[i], labels[i], float(distances[place])))
+    rows: list[dict[str, Any]] = []
+    cells = []
+    for rank, (name, label, value) in enumerate(nearest, 1):
+        rows.append({"rank": rank, "distance": value, "name": name, "class": label})
+        cells.append((rank, f"{value:.3g}", name, label or "-"))
     print(text_table(("rank", "distance", "body", "class"), cells, left=("body", "class")))
     if n_missing:
         print(
@@ -383,11 +383,8 @@ def _write_retrieval(
                 yield names[i], place, names[j], f"{row[j]:.6g}", int(labels[i] == labels[j])
 
     write_rows(out / "ranking.csv", ("query", "rank", "model", "distance", "relevant"), ranking())
-    write_rows(
-        out / "failures.csv",
-        ("name", "error"),
-        [(failure.id, failure.error) for failure in result.failures],
-    )
+    failures = [(failure.id, failure.error) for failure in result.failures]
+    write_rows(out / "failures.csv", ("name", "error"), failures)
     write_mending_notes(out / "notes.csv", result.dataset)
     write_sources(out, result.dataset)
     if result.name is None:  # a descriptor whose centres were fitted to the collection has no name
