@@ -219,7 +219,7 @@ def _choice(card: Mapping[str, Any]) -> str:
         ]
         table = "\n".join(rows)
         text += f"""
-Chosen on held-out bodies of the same folder: {", ".join(card["parts"])} by the head `{card["head"]}`. What each adds:
+Chosen on held-out bodies of the same folder: {", ".join(card["parts"])} by the head `{card["head"]}`. Scores of each:
 
 | | |
 |---|---|
