@@ -84,7 +84,7 @@ def _quadrics(points: Floats, faces: Integers) -> Floats:
     for square in squares:
         at_corners = np.repeat(areas * square, 3)
         columns.append(np.bincount(faces.ravel(), at_corners, len(points)))
-    return np.stack(columns, axis=1)
+    return np.column_stack(columns)
 
 
 @compiled(**ALLOCATES)

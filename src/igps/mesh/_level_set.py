@@ -178,7 +178,7 @@ def _is_solid(
 
 def _points_at(numbers: Integers, shape: tuple[int, ...]) -> Integers:
     """Return the grid points (P, 3) with these numbers in the flattened grid."""
-    return np.stack(np.unravel_index(numbers, shape), axis=1)
+    return np.column_stack(np.unravel_index(numbers, shape))
 
 
 def _nearest_values(values: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:

@@ -13,6 +13,7 @@ from igps.mesh.errors import MeshError
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import (
     TINY,
+    both_ways,
     compact,
     diagonal,
     directed_edges,
@@ -325,13 +326,13 @@ def _span(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
 def _circle(turns: Floats, radius: float) -> Floats:
     angles = 2 * np.pi * turns
     circle = [np.cos(angles), np.sin(angles)]
-    return radius * np.stack(circle, axis=1)
+    return radius * np.column_stack(circle)
 
 
 def _solve_umbrella(fixed: Floats, faces: Integers, n_points: int, order: int) -> Floats:
     """Return the points after the fixed ones, placed so that the umbrella operator to the power `order` is 0."""
     edges, _ = undirected_edges(faces)
-    start, end = np.concatenate([edges, edges[:, ::-1]]).T
+    start, end = both_ways(edges)
     ones = np.ones(len(start))
     graph = sparse.csr_array((ones, (start, end)), shape=(n_points, n_points))
     averaging = sparse.diags_array(1 / graph.sum(axis=1)) @ graph

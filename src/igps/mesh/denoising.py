@@ -22,6 +22,7 @@ from igps._arrays import Floats, Integers
 from igps.mesh.surface import (
     TINY,
     area_vectors,
+    both_ways,
     dots,
     edge_lengths,
     lengths,
@@ -114,7 +115,7 @@ class Neighbours:
     @classmethod
     def of(cls, vertices: Floats, edges: Integers) -> Self:
         n = len(vertices)
-        here, there = np.concatenate([edges, edges[:, ::-1]]).T
+        here, there = both_ways(edges)
 
         def sum_around(values: Floats) -> Floats:
             """Return the sums (V,) of values (2E,) at the edges around each vertex."""

@@ -89,7 +89,7 @@ def _non_manifold_edges(faces: Integers, n_vertices: int) -> Integers:
     repeated = distinct[count > 1]
     one_way = np.setxor1d(forward, backward)
     keys = np.concatenate([repeated, one_way])
-    return np.stack(np.divmod(keys, n_vertices), axis=1)
+    return np.column_stack(np.divmod(keys, n_vertices))
 
 
 def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
@@ -117,8 +117,8 @@ def _flip_edges(vertices: Floats, faces: Integers) -> Integers:
             break
         a, b, c, d = corners[:, flips]
         faces = faces.copy()
-        faces[left[flips]] = np.stack([c, d, b], axis=1)
-        faces[right[flips]] = np.stack([d, c, a], axis=1)
+        faces[left[flips]] = np.column_stack([c, d, b])
+        faces[right[flips]] = np.column_stack([d, c, a])
     return faces
 
 
@@ -167,7 +167,7 @@ def _are_edges(a: Integers, b: Integers, faces: Integers, n_vertices: int) -> Bo
 
 def _independent(left: Integers, right: Integers, gain: Floats, new_edges: Integers) -> Integers:
     """Choose flips: each face takes part only in its best one, and no two create the same edge."""
-    pairs = np.stack([left, right], axis=1)
+    pairs = np.column_stack([left, right])
     n_faces = pairs.max(initial=-1) + 1
     best = np.full(n_faces, -np.inf)
     np.maximum.at(best, left, gain)
@@ -176,8 +176,9 @@ def _independent(left: Integers, right: Integers, gain: Floats, new_edges: Integ
     chosen = np.flatnonzero(is_best)
     _, first = np.unique(new_edges[chosen], return_index=True)
     chosen = chosen[first]
-    n_flips = np.bincount(pairs[chosen].ravel(), minlength=n_faces)
-    is_alone = (n_flips[pairs[chosen]] == 1).all(axis=1)
+    pairs = pairs[chosen]
+    n_flips = np.bincount(pairs.ravel(), minlength=n_faces)
+    is_alone = (n_flips[pairs] == 1).all(axis=1)
     return chosen[is_alone]
 
 
@@ -185,4 +186,5 @@ def _angle(apex: Floats, a: Floats, b: Floats) -> Floats:
     u = a - apex
     v = b - apex
     sine = lengths(np.cross(u, v))
-    return np.arctan2(sine, dots(u, v))
+    cosine = dots(u, v)
+    return np.arctan2(sine, cosine)

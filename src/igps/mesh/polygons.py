@@ -27,7 +27,7 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
     first = np.repeat(starts[is_large], n_triangles)
     number = np.arange(len(first)) - np.repeat(n_before, n_triangles)
     second = first + 1 + number
-    fans = np.stack([first, second, second + 1], axis=1)
+    fans = np.column_stack([first, second, second + 1])
     return np.concatenate([of_size(3), first_halves, second_halves, corners[fans]])
 
 

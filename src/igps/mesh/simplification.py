@@ -104,5 +104,5 @@ def _cut(vertices: Floats, faces: Integers, middle: Integers) -> Integers:
     pieces += [(p, b, q), second, third]
     a, b, c, p, q, r = rotated(3)
     pieces += [(a, p, r), (p, b, q), (r, q, c), (p, q, r)]
-    divided = [np.stack(corners, axis=1) for corners in pieces]
+    divided = [np.column_stack(corners) for corners in pieces]
     return np.vstack([faces[n_cut == 0], *divided])

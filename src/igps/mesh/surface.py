@@ -44,7 +44,7 @@ def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
 def sums(index: Integers, rows: Floats, n: int) -> Floats:
     """Return the sums (n, D) of the rows (R, D) with each index (R,)."""
     columns = [np.bincount(index, column, n) for column in rows.T]
-    return np.stack(columns, axis=1)
+    return np.column_stack(columns)
 
 
 def lengths(vectors: NDArray[np.floating]) -> Floats:
@@ -115,7 +115,7 @@ def undirected_edges(faces: Integers) -> tuple[Integers, Integers]:
     start, end = directed_edges(faces)
     keys = edge_keys(start, end, n_vertices)
     distinct, edge_of = np.unique(keys, return_inverse=True)
-    edges = np.stack(np.divmod(distinct, n_vertices), axis=1)
+    edges = np.column_stack(np.divmod(distinct, n_vertices))
     return edges, edge_of
 
 
@@ -123,6 +123,12 @@ def has_twins(faces: Integers) -> Booleans:
     """Return which faces (F,) have the same vertex twice."""
     is_twin = faces == np.roll(faces, 1, axis=1)
     return np.asarray(is_twin.any(axis=1))
+
+
+def both_ways(edges: Integers) -> tuple[Integers, Integers]:
+    """Return the first and the second vertex of edges (E, 2), and of the same edges reversed: (2E,) each."""
+    start, end = edges.T
+    return np.concatenate([start, end]), np.concatenate([end, start])
 
 
 def edge_keys(start: Integers, end: Integers, n_vertices: int) -> Integers:

@@ -86,18 +86,21 @@ def _distance(body: Sequence[Placed], points: Floats) -> Floats:
     x, y, z = points.T
     total = body[0].distance(x, y, z)
     for part in body[1:]:
-        total = _smooth_minimum(total, part.distance(x, y, z), part.blend)
+        distance = part.distance(x, y, z)
+        total = _smooth_minimum(total, distance, part.blend)
     return total
 
 
 def _smooth_minimum(a: Floats, b: Floats, blend: float) -> Floats:
     """Return the polynomial smooth union of two distances, their minimum unless they differ by less than ``blend``."""
     overlap = np.maximum(blend - np.abs(a - b), 0.0)
-    return np.minimum(a, b) - overlap * overlap / (4.0 * blend)
+    depth = overlap * overlap / (4.0 * blend)
+    return np.minimum(a, b) - depth
 
 
 def _bounds(body: Sequence[Placed]) -> tuple[Floats, Floats]:
-    lows, highs = zip(*(part.bounds() for part in body), strict=True)
+    boxes = [part.bounds() for part in body]
+    lows, highs = zip(*boxes, strict=True)
     return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
@@ -109,7 +112,8 @@ def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
     size = high + margin - low
     n_steps = np.ceil(size / spacing)
     shape = n_steps.astype(int) + 1
-    x, y, z = (start + spacing * np.arange(n) for start, n in zip(low, shape, strict=True))
+    axes = [start + spacing * np.arange(n) for start, n in zip(low, shape, strict=True)]
+    x, y, z = axes
     grid = np.full(shape, 1e3)  # far outside
     for part in body:
         first, last = part.bounds()
@@ -118,8 +122,9 @@ def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
         start = np.maximum(first_step.astype(int), 0)
         stop = np.minimum(last_step.astype(int) + 1, shape)
         i, j, k = map(slice, start, stop)
+        window = (i, j, k)
         distance = part.distance(*np.ix_(x[i], y[j], z[k]))
-        grid[i, j, k] = _smooth_minimum(grid[i, j, k], distance, part.blend)
+        grid[window] = _smooth_minimum(grid[window], distance, part.blend)
     return low, grid
 
 

@@ -58,4 +58,4 @@ def _in_triangles(n_points: int, generator: np.random.Generator) -> Floats:
     """Draw uniform barycentric coordinates (P, 3) in a triangle (Osada et al. 2002, equation 1)."""
     r = np.sqrt(generator.random(n_points))
     s = generator.random(n_points)
-    return np.stack([1 - r, r * (1 - s), r * s], axis=1)
+    return np.column_stack([1 - r, r * (1 - s), r * s])

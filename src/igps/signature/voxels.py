@@ -69,7 +69,7 @@ def _centres(axes: tuple[Floats, ...], is_chosen: Booleans) -> Floats:
     """Return the centres (P, 3) of the chosen cells (X, Y, Z)."""
     x_axis, y_axis, z_axis = axes
     x, y, z = np.nonzero(is_chosen)
-    return np.stack([x_axis[x], y_axis[y], z_axis[z]], axis=1)
+    return np.column_stack([x_axis[x], y_axis[y], z_axis[z]])
 
 
 def _max_resolution(mesh: Mesh) -> int:

@@ -112,7 +112,7 @@ def _full_tree(n_levels: int) -> tuple[Integers, Integers]:
         left = right - (2 ** (n_levels - level - 1) - 1)  # the whole right subtree lies between
         node_at[2 * places + 1] = left
         node_at[2 * places + 2] = right
-        children[parents] = np.stack([left, right], axis=1)
+        children[parents] = np.column_stack([left, right])
     return node_at, children
 
 
