@@ -167,13 +167,13 @@ def _crossings(
     # whatever the face, so both faces compute the same point.
     start, end = directed_edges(faces)
     is_upward = vertices[start, 2] < vertices[end, 2]
-    low = vertices[np.where(is_upward, start, end)]
-    high = vertices[np.where(is_upward, end, start)]
-    first = np.searchsorted(z_axis, low[:, 2])
-    last = np.searchsorted(z_axis, high[:, 2])
+    low = np.where(is_upward, start, end)
+    high = np.where(is_upward, end, start)
+    first = np.searchsorted(z_axis, vertices[low, 2])
+    last = np.searchsorted(z_axis, vertices[high, 2])
     half_edge, row = _ranges(first, last)
-    a = low[half_edge]
-    edge = high[half_edge] - a
+    a = vertices[low[half_edge]]
+    edge = vertices[high[half_edge]] - a
     t = (z_axis[row] - a[:, 2]) / edge[:, 2]
     x = a[:, 0] + t * edge[:, 0]
     y = a[:, 1] + t * edge[:, 1]
