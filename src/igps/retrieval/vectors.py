@@ -65,7 +65,8 @@ class VectorMap:
         blocks: list[Singles] = [np.zeros((0, len(self.components)), dtype=np.float32)]
         for first in range(0, len(descriptions), _BLOCK_ROWS):
             features = self._features(descriptions[first : first + _BLOCK_ROWS])
-            blocks.append((features - self.mean) @ self.components.T)
+            centred = np.subtract(features, self.mean, dtype=np.float32)
+            blocks.append(centred @ self.components.T)
         return np.concatenate(blocks)
 
     def arrays(self) -> dict[str, Any]:
