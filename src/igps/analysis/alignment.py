@@ -74,8 +74,8 @@ def _spread(mesh: Mesh, n: int) -> tuple[Floats, Floats]:
     vectors = area_vectors(mesh.vertices, mesh.faces)
     ends = np.linalg.norm(vectors, axis=1).cumsum()
     shares = (np.arange(n) + random.random(n)) / n
-    chosen = np.searchsorted(ends, shares * ends[-1])
-    chosen = random.permutation(np.minimum(chosen, len(ends) - 1))
+    faces = np.searchsorted(ends, shares * ends[-1])
+    chosen = random.permutation(np.minimum(faces, len(ends) - 1))
     weights = random.dirichlet(np.ones(3), n)
     corners = mesh.vertices[mesh.faces[chosen]]
     points = np.einsum("nk,nkc->nc", weights, corners)
@@ -97,23 +97,21 @@ def _turns(points: Floats, target: Floats) -> list[Floats]:
 
 
 def _fitted(motion: Motion, points: Floats, target: _Target, n_steps: int) -> Motion:
+    n_kept = int(_KEPT * len(points))
     for _ in range(n_steps):
         moved = motion.of(points)
         _, nearest = target.tree.query(moved)
-        normals = target.normals[nearest]
         steps = target.points[nearest] - moved
-        gaps = (steps * normals).sum(axis=1)
+        gaps = (steps * target.normals[nearest]).sum(axis=1)
         gaps -= np.median(gaps)  # a body that is larger all around stays where it is
-        n_kept = int(_KEPT * len(points))
         kept = np.argsort(np.abs(gaps))[:n_kept]
-        normals = normals[kept]
-        gaps = gaps[kept]
+        normals = target.normals[nearest[kept]]
         centre = moved.mean(axis=0)
         size = np.linalg.norm(moved - centre, axis=1).mean()
         arms = (moved[kept] - centre) / size
         columns = np.hstack([np.cross(arms, normals), normals])
         # Bodies of revolution leave a turn free: the smallest solution does not turn them
-        solution = np.linalg.lstsq(columns, gaps, rcond=1e-3)[0]
+        solution, *_ = np.linalg.lstsq(columns, gaps[kept], rcond=1e-3)
         angles = solution[:3] / size
         turn = Rotation.from_rotvec(angles).as_matrix()
         shift = turn @ (motion.shift - centre) + centre + solution[3:]

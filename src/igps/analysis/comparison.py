@@ -92,7 +92,8 @@ def compare(
     check_descriptors(descriptors, dataset)
     n = len(dataset)
     cpu = torch.device("cpu")
-    jobs = [(descriptor, dataset.subset([i]), cpu) for descriptor in descriptors for i in range(n)]
+    bodies = [dataset.subset([i]) for i in range(n)]
+    jobs = [(descriptor, body, cpu) for descriptor in descriptors for body in bodies]
     # Outcomes of descriptors that are not complete, by job
     pending: dict[int, _Description | Failure] = {}
     n_done = 0
@@ -103,7 +104,8 @@ def compare(
         for number, outcome in outcomes:
             bar.update()
             if isinstance(outcome, Failed):
-                pending[number] = failure = Failure.of(dataset.bodies, number % n, outcome.reason)
+                failure = Failure.of(dataset.bodies, number % n, outcome.reason)
+                pending[number] = failure
                 message = f"{descriptors[number // n].name}: {failure.error}"
                 if strict:
                     raise MeshError(message)
@@ -125,7 +127,8 @@ def check_descriptors(descriptors: Sequence[Descriptor], dataset: SignatureDatas
 
 def check_names(names: Sequence[str]) -> None:
     """Raise a ValueError if two descriptors have the same name, because results are identified by names."""
-    if repeated := sorted({name for name in names if names.count(name) > 1}):
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
         raise ValueError(
             f"descriptors: expected different names, got {', '.join(repeated)} more than once. List each descriptor "
             "once, and give your own descriptors another `name`."
@@ -142,11 +145,14 @@ def _result(
     bodies = dataset.usable(failures).bodies
     labels = bodies.labels or ()
     described = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
-    distances, scores, error = None, None, None
+    distances = None
+    scores = None
+    error = None
     try:
         if not described:
             raise ValueError("no mesh could be described.")
-        descriptions = torch.from_numpy(np.stack([description[0] for description, _ in described]))
+        rows = np.stack([description[0] for description, _ in described])
+        descriptions = torch.from_numpy(rows)
         distances = pair_distances(descriptor, descriptions, progress=progress)
         scores = retrieval_scores(distances, labels)
     except Exception as reason:  # must not stop the comparison of the other descriptors

@@ -8,11 +8,12 @@ from scipy.spatial.distance import cdist
 
 from igps._arrays import Floats, Integers
 from igps.data.batch import Body
-from igps.data.requirements import Requirements
+from igps.data.requirements import SURFACE_DIRECTION
 from igps.mesh.surface import unit
 
-REQUIREMENTS = Requirements(attributes=("surface_direction",))
+REQUIREMENTS = SURFACE_DIRECTION
 """What bodies must have beside samples: outward normals."""
+
 
 # Times of the heat kernel over the area. The kernel of large times identifies the place on the body, the kernel of
 # small times depends on the surface around it
@@ -136,7 +137,8 @@ def local_shape(body: Body) -> Floats:
 def _tangents(normals: Floats) -> Floats:
     """Return two orthonormal tangents at each normal, (P, 3, 2)."""
     smallest = np.abs(normals).argmin(axis=1)
-    first = unit(np.cross(normals, np.eye(3)[smallest]))
+    apart = np.eye(3)[smallest]
+    first = unit(np.cross(normals, apart))
     second = np.cross(normals, first)
     return np.stack([first, second], axis=2)
 
@@ -188,7 +190,8 @@ def _inner_balls(points: Floats, normals: Floats) -> Floats:
         diameters = np.where(counts, 2 * depths, 1)
         # Radius of the ball that touches here and runs through each other point
         through = np.where(counts, squares / diameters, _MAX_BALL)
-        radii[rows] = np.partition(through, 2, axis=1)[:, 2]
+        smallest = np.partition(through, 2, axis=1)
+        radii[rows] = smallest[:, 2]
     return np.minimum(radii, _MAX_BALL)
 
 
@@ -197,6 +200,7 @@ def _smoothed(values: Floats, points: Floats) -> Floats:
     tree = cKDTree(points)
     pairs = tree.sparse_distance_matrix(tree, 2 * _SMOOTHING, output_type="coo_matrix")
     weights = np.exp(-np.square(pairs.data / _SMOOTHING) / 2)
-    sums = np.bincount(pairs.row, weights * values[pairs.col], len(points))
+    weighted = weights * values[pairs.col]
+    sums = np.bincount(pairs.row, weighted, len(points))
     totals = np.bincount(pairs.row, weights, len(points))
     return sums / totals

@@ -66,7 +66,8 @@ class Finding:
         facts: list[str] = []
         if self.n_pieces is not None and self.n_pieces > 1:
             facts.append(counted(self.n_pieces, "piece"))
-        if self.missing >= _MIN_MISSING and not any(note.startswith("open") for note in self.notes):
+        is_noted = any(note.startswith("open") for note in self.notes)
+        if self.missing >= _MIN_MISSING and not is_noted:
             facts.append(f"open: {self.missing:.1%} of the surface is missing")
         others = [note for note in self.notes if not repair_steps([note])]
         return (*facts, *self.steps, *others)

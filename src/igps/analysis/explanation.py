@@ -104,7 +104,9 @@ def explain(
     parts = _part_shares(descriptor, shares)
     samples = _sample_shares(descriptor, pair, units, shares)
     if weights is None:
-        weights = (dissimilarity(one[0], other[0]), dissimilarity(other[0], one[0]))
+        body = one[0]
+        other_body = other[0]
+        weights = (dissimilarity(body, other_body), dissimilarity(other_body, body))
     on_first = _on_surface(distance / 2, weights[0], samples[0])
     on_second = _on_surface(distance / 2, weights[1], samples[1])
     return Explanation(distance, parts, samples, (on_first, on_second))
@@ -166,7 +168,8 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
 
 def _with_roots(contents: Tensor, n_cells: int) -> Tensor:
     """Return contents (N, cells + others) with square roots of the cells."""
-    return torch.cat([contents[:, :n_cells].sqrt(), contents[:, n_cells:]], dim=1)
+    roots = contents[:, :n_cells].sqrt()
+    return torch.cat([roots, contents[:, n_cells:]], dim=1)
 
 
 def _distances_of_roots(descriptor: Descriptor, pairs: Tensor) -> Tensor:

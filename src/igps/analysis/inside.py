@@ -81,12 +81,15 @@ def inside_numbers(signature: Signature, attributes: Sequence[str]) -> dict[str,
     places = _Places.of(signature)
     numbers: dict[str, float] = dict.fromkeys(column_names(attributes), np.nan)
     for name, own in values.items():
-        found = _numbers_of(own, places)
-        numbers |= {f"{name}.{key}": number for key, number in found.items()}
+        numbers |= _called(name, _numbers_of(own, places))
     for first, second in combinations(attributes, 2):
-        joint = _joint(values[first], values[second])
-        numbers |= {f"{first}_and_{second}.{key}": number for key, number in joint.items()}
+        numbers |= _called(f"{first}_and_{second}", _joint(values[first], values[second]))
     return numbers
+
+
+def _called(prefix: str, numbers: Mapping[str, float]) -> dict[str, float]:
+    """Return numbers with a prefix to their names."""
+    return {f"{prefix}.{name}": number for name, number in numbers.items()}
 
 
 def _scalar_values(signature: Signature, name: str) -> Floats:
@@ -121,12 +124,15 @@ class _Places:
         potential = np.square(embedded).sum(axis=1)
         depth = samples.attributes["depth"]
         classes = _thirds(potential, BY_POTENTIAL) | _thirds(depth, BY_DEPTH)
-        axes = [samples.eigenfunctions[:, modes] for modes in _axes(signature.eigenvalues)]
-        centred = [(axis - axis.mean(axis=0)).astype(np.float64) for axis in axes]
+        axes = []
+        for modes in _axes(signature.eigenvalues):
+            values = samples.eigenfunctions[:, modes]
+            centred = values - values.mean(axis=0)
+            axes.append(centred.astype(np.float64))
         # At equal steps in the order of the samples, which depends on the shape alone
         n_paired = min(_N_PAIRED, len(samples))
         paired = np.arange(n_paired) * len(samples) // n_paired
-        return _Places(classes, centred, _pair_classes(embedded, paired))
+        return _Places(classes, axes, _pair_classes(embedded, paired))
 
 
 def _thirds(values: Floats | Singles, names: Sequence[str]) -> dict[str, Booleans]:
@@ -166,8 +172,7 @@ def _pair_classes(embedded: Floats, chosen: Integers) -> dict[str, tuple[Integer
 def _numbers_of(values: Floats, places: _Places) -> dict[str, float]:
     numbers = _distribution(values)
     for name, members in places.classes.items():
-        of_class = _distribution(values[members])
-        numbers |= {f"{name}.{key}": number for key, number in of_class.items()}
+        numbers |= _called(name, _distribution(values[members]))
     if is_constant(values):
         return numbers
     sd = values.std()
@@ -197,7 +202,8 @@ def _distribution(values: Floats) -> dict[str, float]:
 def brightest(values: Floats) -> Floats:
     """Return how far each of P samples counts among the brightest tenth, 0 to 1; equal values count equally."""
     n_wanted = _BRIGHT * len(values)
-    limit = np.sort(values)[len(values) - int(np.ceil(n_wanted))]
+    n_below = len(values) - int(np.ceil(n_wanted))
+    limit = np.sort(values)[n_below]
     is_above = values > limit
     is_equal = values == limit
     share = (n_wanted - is_above.sum()) / is_equal.sum()
@@ -214,9 +220,9 @@ def _correlation(a: Floats, b: Floats) -> float:
 def _multiple_correlation(values: Floats, modes: Floats) -> float:
     """Return the coefficient, 0 to 1, of the best linear prediction of values (P,) by modes (P, m) of mean 0."""
     centred = values - values.mean()
-    weights = np.linalg.lstsq(modes, centred, rcond=None)[0]
-    explained = float(np.linalg.norm(modes @ weights) / np.linalg.norm(centred))
-    return min(explained, 1.0)
+    weights, *_ = np.linalg.lstsq(modes, centred, rcond=None)
+    explained = np.linalg.norm(modes @ weights) / np.linalg.norm(centred)
+    return min(float(explained), 1.0)
 
 
 def _spatial(values: Floats, places: _Places) -> dict[str, float]:
@@ -226,8 +232,10 @@ def _spatial(values: Floats, places: _Places) -> dict[str, float]:
     numbers = {}
     for name, (first, second) in places.pairs.items():
         steps = values[first] - values[second]
-        numbers[f"variogram.{name}"] = float(0.5 * np.square(steps).mean() / variance)
-    numbers["moran"] = _moran(centred, *places.pairs[PAIR_CLASSES[0]])
+        half_square = 0.5 * np.square(steps).mean()
+        numbers[f"variogram.{name}"] = float(half_square / variance)
+    near = places.pairs[PAIR_CLASSES[0]]
+    numbers["moran"] = _moran(centred, *near)
     return numbers
 
 
@@ -246,14 +254,13 @@ def _joint(a: Floats, b: Floats) -> dict[str, float]:
     """Return how the values of two attributes at the same samples go together; nothing if one is constant."""
     if is_constant(a) or is_constant(b):
         return {}
-    bright_in_both = np.minimum(brightest(a), brightest(b))
-    numbers = (
-        _correlation(a, b),
-        _correlation(rankdata(a), rankdata(b)),
-        float(bright_in_both.sum() / (_BRIGHT * len(a))),
-        _information(_quarters(a), _quarters(b)),
-    )
-    return dict(zip(JOINT, numbers, strict=True))
+    n_bright = np.minimum(brightest(a), brightest(b)).sum()
+    return {
+        "correlation": _correlation(a, b),
+        "rank_correlation": _correlation(rankdata(a), rankdata(b)),
+        "overlap": float(n_bright / (_BRIGHT * len(a))),
+        "information": _information(_quarters(a), _quarters(b)),
+    }
 
 
 def _quarters(values: Floats) -> Integers:

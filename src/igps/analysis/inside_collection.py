@@ -77,7 +77,8 @@ def standard_scores(numbers: Floats) -> Floats:
     spread = numbers.std(axis=0)
     size = np.abs(numbers).max(axis=0)
     varies = spread > _ROUNDING * size
-    return (numbers[:, varies] - numbers[:, varies].mean(axis=0)) / spread[varies]
+    chosen = numbers[:, varies]
+    return (chosen - chosen.mean(axis=0)) / spread[varies]
 
 
 def inside_table(

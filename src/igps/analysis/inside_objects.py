@@ -83,7 +83,8 @@ def _sides_of_voxel(labels: Grid) -> Floats:
     """Return the sides (3,) of a voxel; raise a ValueError unless the axes of the grid have right angles."""
     axes = labels.affine[:3, :3]
     sides = np.linalg.norm(axes, axis=0)
-    cosines = (axes / sides).T @ (axes / sides) - np.eye(3)
+    directions = axes / sides
+    cosines = directions.T @ directions - np.eye(3)
     if not np.abs(cosines).max() < _RIGHT_ANGLES:  # also if NaN
         raise ValueError(
             "label: expected voxels with right angles. Resample the labels to a grid without shear."

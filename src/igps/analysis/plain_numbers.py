@@ -46,7 +46,8 @@ def _of_measures(dataset: SignatureDataset) -> dict[str, Tensor]:
         rows = []
         for row in dataset.measures():
             rows.append([row.get(name, math.nan) for name in POWERS])
-        columns = measures.logarithms(torch.tensor(rows, dtype=torch.float64), dataset.units())
+        numbers = torch.tensor(rows, dtype=torch.float64)
+        columns = measures.logarithms(numbers, dataset.units())
         descriptions = columns / measures.spread
         found[measures.name] = euclidean(descriptions, descriptions)
     return found
@@ -58,7 +59,8 @@ def _of_residues(dataset: SignatureDataset) -> dict[str, Tensor]:
     if source is None:
         return {}
     anywhere = np.zeros((1, 3))
-    rows = torch.from_numpy(np.concatenate([source(body, anywhere) for body in dataset.bodies]))
+    values = np.concatenate([source(body, anywhere) for body in dataset.bodies])
+    rows = torch.from_numpy(values)
     shares = rows[:, :-1]
     lengths = rows[:, -1:]
     return {

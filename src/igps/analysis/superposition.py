@@ -41,11 +41,14 @@ def superposition(points: Floats, others: Floats) -> Superposition:
     for _ in range(_MAX_STEPS):
         centre = np.average(points, axis=0, weights=weights)
         other_centre = np.average(others, axis=0, weights=weights)
-        turn, _ = Rotation.align_vectors(points - centre, others - other_centre, weights=weights)
-        distances = np.linalg.norm(points - centre - turn.apply(others - other_centre), axis=1)
-        narrow = max(_WIDTH * float(np.median(distances)), 1e-9)
+        own = points - centre
+        other = others - other_centre
+        turn, _ = Rotation.align_vectors(own, other, weights=weights)
+        distances = np.linalg.norm(own - turn.apply(other), axis=1)
+        narrowest = max(_WIDTH * float(np.median(distances)), 1e-9)
         before = width
-        width = max(narrow, min(_STEP * before, float(distances.max())))
+        narrower = min(_STEP * before, float(distances.max()))
+        width = max(narrowest, narrower)
         if abs(width - before) <= 1e-4 * width:
             break
         weights = 1 / np.square(1 + np.square(distances / width))
@@ -74,7 +77,8 @@ class Movement:
     def _weights(self, points: Floats, side: int) -> Floats:
         places = self.correspondence.places[side]
         _, nearest = cKDTree(places.points).query(points)
-        return np.square(self.displacements[side][places.place_of[nearest]])
+        own_places = places.place_of[nearest]
+        return np.square(self.displacements[side][own_places])
 
 
 def movement(one: BodyRef, other: BodyRef) -> Movement | None:

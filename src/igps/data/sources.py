@@ -7,6 +7,7 @@ import io
 import logging
 import math
 import os
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -76,12 +77,13 @@ class Bodies:
 
     def subset(self, indices: Sequence[int]) -> Bodies:
         """Return the bodies with these indices, in this order."""
-        return Bodies(
-            tuple(self.refs[i] for i in indices),
-            tuple(self.names[i] for i in indices),
-            None if self.labels is None else tuple(self.labels[i] for i in indices),
-            {name: tuple(values[i] for i in indices) for name, values in self.columns.items()},
-        )
+        refs = tuple(self.refs[i] for i in indices)
+        names = tuple(self.names[i] for i in indices)
+        labels = self.labels and tuple(self.labels[i] for i in indices)
+        columns = {}
+        for name, values in self.columns.items():
+            columns[name] = tuple(values[i] for i in indices)
+        return Bodies(refs, names, labels, columns)
 
     def column(self, name: str) -> tuple[str, ...]:
         """Return the values of a column such as "scanner"; raise a ValueError if a body has no value."""
@@ -125,10 +127,11 @@ class Bodies:
                 f"classes: expected files of several bodies with 'body', but {self.names[0]} is one body."
             )
         # Files without parts, for example because they cannot be read, have classes by their own names
-        stems = [path.name.partition(".")[0] for path in self.paths]
-        return replace(
-            self, labels=tuple(part or stem for part, stem in zip(self.parts, stems, strict=True))
-        )
+        labels = []
+        for path, part in zip(self.paths, self.parts, strict=True):
+            stem, _, _ = path.name.partition(".")
+            labels.append(part or stem)
+        return replace(self, labels=tuple(labels))
 
 
 def find_bodies(
@@ -225,10 +228,11 @@ def bodies_of_files(
     files = [file_and_part(Path(path)) for path in paths]
     if not files:
         raise ValueError("paths: expected at least one mesh file, got none.")
-    if invalid := [file for file, _ in files if not _is_utf8(file.absolute())]:
-        raise ValueError(
-            f"paths: expected names in UTF-8, got {os.fsencode(invalid[0])!r}. Rename the file."
-        )
+    for file, _ in files:
+        if not _is_utf8(file.absolute()):
+            raise ValueError(
+                f"paths: expected names in UTF-8, got {os.fsencode(file)!r}. Rename the file."
+            )
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
     rows = []
@@ -266,11 +270,14 @@ def bodies_of(
 
 def file_and_part(path: Path) -> tuple[Path, str | None]:
     """Split ``FILE#PART``; the part is None if the whole path exists, or if no file precedes a "#"."""
+    if os.path.exists(path):
+        return path, None
     name = str(path)
-    marks = [] if os.path.exists(path) else [i for i, letter in enumerate(name) if letter == "#"]
-    for i in marks:
-        if name[i + 1 :] and (file := Path(name[:i])).is_file():
-            return file, name[i + 1 :]
+    for mark in re.finditer("#", name):
+        file = Path(name[: mark.start()])
+        part = name[mark.end() :]
+        if part and file.is_file():
+            return file, part
     return path, None
 
 

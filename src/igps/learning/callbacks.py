@@ -66,8 +66,10 @@ class TrainingCurve(Callback):
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Collect the validation scores."""
-        metrics = trainer.callback_metrics.items()
-        self._scores = {name: float(value) for name, value in metrics if name.startswith("val_")}
+        self._scores = {}
+        for name, value in trainer.callback_metrics.items():
+            if name.startswith("val_"):
+                self._scores[name] = float(value)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Add the row of the epoch, and write the file."""
@@ -75,8 +77,9 @@ class TrainingCurve(Callback):
         self.rows.append({"epoch": trainer.current_epoch, "train_loss": loss, **self._scores})
         self._scores = {}
         if trainer.is_global_zero:
-            names = {name: None for row in self.rows for name in row}
-            with (Path(trainer.default_root_dir) / "curve.csv").open("w", newline="") as file:
+            names = dict.fromkeys(name for row in self.rows for name in row)
+            path = Path(trainer.default_root_dir) / "curve.csv"
+            with path.open("w", newline="") as file:
                 table = csv.DictWriter(file, list(names))
                 table.writeheader()
                 table.writerows(self.rows)

@@ -388,14 +388,20 @@ def classification_scores(
     bins = (confidences * _N_BINS).long()
     excess = confidences - is_right.to(confidences)
     gaps = confidences.new_zeros(_N_BINS + 1).index_add(0, bins, excess)
+    accuracies = []
+    areas = []
+    for number in present:
+        is_of_class = targets == number
+        accuracies.append(float(is_right[is_of_class].float().mean()))
+        if len(present) > 1:
+            areas.append(float(roc_auc_score(is_of_class, probabilities[:, number])))
     scores = {
         "accuracy": float(is_right.float().mean()),
-        "balanced_accuracy": fmean(float(is_right[targets == c].float().mean()) for c in present),
+        "balanced_accuracy": fmean(accuracies),
         "calibration_error": float(gaps.abs().sum() / len(targets)),
     }
-    if len(present) > 1:
-        areas = [roc_auc_score(targets == c, probabilities[:, c]) for c in present]
-        scores["auc"] = fmean(map(float, areas))
+    if areas:
+        scores["auc"] = fmean(areas)
     return scores
 
 

@@ -3,7 +3,6 @@
 import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from pathlib import Path
 from statistics import fmean
 
 from igps.data.dataset import SignatureDataset
@@ -24,8 +23,8 @@ def shortcuts(dataset: SignatureDataset) -> list[str]:
     if labels is None or len(labels) < _MIN_BODIES or len(set(labels)) < 2:
         return []
     values: dict[str, Sequence[str]] = {
-        "the type of file": ["".join(Path(path).suffixes) for path in bodies.paths],
-        "the name of the file": [_pattern(path) for path in bodies.paths],
+        "the type of file": ["".join(path.suffixes) for path in bodies.paths],
+        "the name of the file": [_without_digits(path.name) for path in bodies.paths],
         "the unit": [str(unit) for unit in dataset.units()],
     }
     for column, entries in bodies.columns.items():
@@ -41,14 +40,14 @@ def shortcuts(dataset: SignatureDataset) -> list[str]:
     return found
 
 
-def _pattern(path: str | Path) -> str:
-    return re.sub(r"\d+", "#", Path(path).name.lower())
+def _without_digits(name: str) -> str:
+    return re.sub(r"\d+", "#", name.lower())
 
 
 def _names_classes(patterns: Sequence[str], labels: Sequence[str]) -> bool:
     """Return whether files are called by their classes."""
     pairs = zip(patterns, labels, strict=True)
-    return all(re.sub(r"\d+", "#", label.lower()) in pattern for pattern, label in pairs)
+    return all(_without_digits(label) in pattern for pattern, label in pairs)
 
 
 def _accuracy(values: Sequence[str], labels: Sequence[str]) -> float:

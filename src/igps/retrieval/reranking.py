@@ -118,8 +118,9 @@ def _neighbourhoods(
     # The neighbourhood of a member joins if two thirds of it are there.
     n_common = (members @ half_members.T).multiply(members).tocsr()
     sizes = half_members.sum(axis=1)
+    is_joined = 3 * n_common.data >= 2 * sizes[n_common.indices]
     joins = n_common.copy()
-    joins.data = (3 * n_common.data >= 2 * sizes[n_common.indices]).astype(np.int64)
+    joins.data = is_joined.astype(np.int64)
     rows, columns = (members + joins @ half_members).nonzero()
     nearest = np.take_along_axis(distances, order[:, 1 : n_neighbours + 1], axis=1)
     scale = np.maximum(nearest.mean(axis=1), _TINY)

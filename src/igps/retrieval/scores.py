@@ -45,9 +45,8 @@ class RetrievalScores:
     map: Tensor  # average precision, (1/R) Σ_k rel(k) · (hits in the first k)/k
     labels: tuple[Hashable, ...]  # of each query
     scored: Tensor  # (Q,) bool, False where the query has no relevant entry
-    has_single_answers: bool = (
-        False  # whether each scored query has one relevant entry, as in classes of two
-    )
+    # Whether each scored query has one relevant entry, as in classes of two
+    has_single_answers: bool = False
 
     @property
     def n_queries(self) -> int:
@@ -70,9 +69,13 @@ class RetrievalScores:
         the first 10; `map` is the mean of 1/rank, and `median_rank` the median of the rank.
         """
         ranks = 1 / self.map[self.scored]
-        shares = {"nn": 1, "first_5": 5, "first_10": 10}
-        found = {name: float((ranks < n + 0.5).double().mean()) for name, n in shares.items()}
-        return {**found, "map": float((1 / ranks).mean()), "median_rank": float(ranks.median())}
+        scores = {}
+        for name, n_first in {"nn": 1, "first_5": 5, "first_10": 10}.items():
+            is_found = ranks < n_first + 0.5
+            scores[name] = float(is_found.double().mean())
+        scores["map"] = float((1 / ranks).mean())
+        scores["median_rank"] = float(ranks.median())
+        return scores
 
     def per_class(self) -> dict[Hashable, dict[str, float]]:
         """Return the means over the scored queries of each class that has any, classes in order of appearance."""
@@ -186,8 +189,10 @@ def scores_of_queries(
     if is_query is None:
         return retrieval_scores(distances, labels)
     asks = torch.tensor(is_query, device=distances.device)
-    queries = [label for label, asked in zip(labels, is_query, strict=True) if asked]
-    gallery = [label for label, asked in zip(labels, is_query, strict=True) if not asked]
+    queries: list[Any] = []
+    gallery: list[Any] = []
+    for label, asked in zip(labels, is_query, strict=True):
+        (queries if asked else gallery).append(label)
     return retrieval_scores(distances[asks][:, ~asks], queries, gallery)
 
 

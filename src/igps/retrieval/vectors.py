@@ -29,9 +29,8 @@ class VectorMap:
     """
 
     searched_by: SearchDistance  # the distance of the descriptions
-    weights: Singles | None = (
-        None  # (F,) factors of the descriptions, see `Descriptor.search_weights`
-    )
+    # (F,) factors of the descriptions, see `Descriptor.search_weights`
+    weights: Singles | None = None
     # (F,) of the descriptions or their features; None if descriptions stay as they are
     mean: Singles | None = None
     components: Singles | None = None  # (D, F) principal directions, orthonormal
@@ -62,12 +61,12 @@ class VectorMap:
         """(N, F) descriptions to (N, D) vectors."""
         if self.components is None or self.mean is None:
             return np.ascontiguousarray(self._features(descriptions), dtype=np.float32)
-        blocks: list[Singles] = [np.zeros((0, len(self.components)), dtype=np.float32)]
+        vectors = np.empty((len(descriptions), len(self.components)), dtype=np.float32)
         for first in range(0, len(descriptions), _BLOCK_ROWS):
-            features = self._features(descriptions[first : first + _BLOCK_ROWS])
-            centred = np.subtract(features, self.mean, dtype=np.float32)
-            blocks.append(centred @ self.components.T)
-        return np.concatenate(blocks)
+            block = slice(first, first + _BLOCK_ROWS)
+            centred = self._features(descriptions[block]) - self.mean
+            vectors[block] = centred @ self.components.T
+        return vectors
 
     def arrays(self) -> dict[str, Any]:
         """Return the fields that are not None by name, for `numpy.savez`."""

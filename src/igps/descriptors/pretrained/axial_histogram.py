@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from igps.data.requirements import Requirements
+from igps.data.requirements import SURFACE_DIRECTION, Requirements
 from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
@@ -76,7 +76,7 @@ class AxialHistogram(SampleHistogram):
     @property
     def requirements(self) -> Requirements:
         """Requirements of the embedding, and the directions of the samples."""
-        return super().requirements | Requirements(attributes=("surface_direction",))
+        return super().requirements | SURFACE_DIRECTION
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, 3, ...) histograms of the samples of N shapes."""
@@ -101,7 +101,8 @@ class AxialHistogram(SampleHistogram):
         n_points = mask.sum(dim=1)
         positions = (points - centre) @ axes * mask[:, :, None]
         directions = directions @ axes
-        radius = (positions.square().sum(dim=(1, 2)) / n_points).sqrt()
+        squares = positions.square().sum(dim=(1, 2))
+        radius = (squares / n_points).sqrt()
         positions = positions / radius[:, None, None]
         # Components along each axis, (N, 3, P), and along the two other axes, (N, 3, P, 2)
         height = positions.mT
@@ -119,15 +120,16 @@ class AxialHistogram(SampleHistogram):
             soft_memberships(towards_end, self.cosine),
             soft_memberships(outward, self.outward),
         ]
-        counts = counted(
-            joint(place) * sample_weights[:, None, :, None], joint(direction), n_points[:, None]
-        )
+        places = joint(place) * sample_weights[:, None, :, None]
+        counts = counted(places, joint(direction), n_points[:, None])
         return counts.view(-1, *self.shape) / 3
 
 
 def _along_others(components: Tensor) -> Tensor:
     """(N, 3, P) components along each axis to those along the two other axes, (N, 3, P, 2)."""
-    return torch.stack([components.roll(1, 1), components.roll(2, 1)], dim=3)
+    first = components.roll(1, 1)
+    second = components.roll(2, 1)
+    return torch.stack([first, second], dim=3)
 
 
 def principal_axes(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
