@@ -126,11 +126,11 @@ class SignatureDataset(Dataset[LabelledSignature]):
     @property
     def labels(self) -> Tensor:
         """(N,) int64 index of the class of each body in `classes`, −1 if unknown."""
-        index = self.class_to_idx
-        labels = (
-            None if self.bodies.labels is None else [index[name] for name in self.bodies.labels]
-        )
-        return torch.tensor(labels or [-1] * len(self), dtype=torch.int64, device="cpu")
+        labels = [-1] * len(self)
+        if self.bodies.labels is not None:
+            index = self.class_to_idx
+            labels = [index[name] for name in self.bodies.labels]
+        return torch.tensor(labels, dtype=torch.int64, device="cpu")
 
     @property
     def targets(self) -> list[int]:
@@ -144,16 +144,16 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return {name: i for i, name in enumerate(self.classes)}
 
     def __repr__(self) -> str:
-        shown = ", ".join(self.classes[:5]) + (", …" if len(self.classes) > 5 else "")
-        classes = f", {len(self.classes)} classes: {shown}" if self.classes else ""
+        shown = ", ".join(self.classes[:5])
+        more = ", …" if len(self.classes) > 5 else ""
+        classes = f", {len(self.classes)} classes: {shown}{more}" if self.classes else ""
         return f"SignatureDataset({len(self)} bodies{classes}; {self.config.n_kept} eigenpairs)"
 
     @property
     def sizes(self) -> Tensor:
         """(N,) int64 number of interior samples of each body, for `BucketBatchSampler`; reads all Signatures."""
-        return torch.tensor(
-            [len(s.interior) for s in self.signatures()], dtype=torch.int64, device="cpu"
-        )
+        sizes = [len(signature.interior) for signature in self.signatures()]
+        return torch.tensor(sizes, dtype=torch.int64, device="cpu")
 
     def __len__(self) -> int:
         return len(self.bodies)
@@ -177,9 +177,12 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return self.subset(resolve_indices(index, len(self)))
 
     def _item(self, i: int) -> LabelledSignature:
-        label = -1 if self.bodies.labels is None else self.classes.index(self.bodies.labels[i])
+        label = -1
+        if self.bodies.labels is not None:
+            label = self.classes.index(self.bodies.labels[i])
         signature = self._signature(i)
-        signature = signature if self.transform is None else self.transform(signature)
+        if self.transform is not None:
+            signature = self.transform(signature)
         return LabelledSignature(signature, label, self.bodies.names[i], self._sample_kinds)
 
     def _signature(self, i: int) -> Signature:
@@ -187,11 +190,15 @@ class SignatureDataset(Dataset[LabelledSignature]):
         name = self.bodies.names[i]
         if self._loaded is not None:
             return replace(self._loaded[i], name=name)
-        cached = None if (hit := self._hits[i]) is None else self.pipeline.read(hit)
-        signature = replace(cached or self.pipeline.signature(self.bodies[i]), name=name)
+        body = self.bodies[i]
+        hit = self._hits[i]
+        cached = None if hit is None else self.pipeline.read(hit)
+        signature = replace(cached or self.pipeline.signature(body), name=name)
         for attribute, function in self._functions.items():
-            points = {kind: getattr(signature, kind).points for kind in SAMPLE_KINDS}
-            values = {kind: function(self.bodies[i], points[kind]) for kind in SAMPLE_KINDS}
+            values: dict[SampleKind, Any] = {
+                "interior": function(body, signature.interior.points),
+                "surface": function(body, signature.surface.points),
+            }
             signature = with_attribute(signature, attribute, values)
         return signature
 
@@ -245,9 +252,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
         """Return a batch of some of the items, optionally with their meshes."""
-        return collate(
-            [self[i] for i in indices], [self.mesh(i) for i in indices] if meshes else None
-        )
+        items = [self[i] for i in indices]
+        their_meshes = [self.mesh(i) for i in indices] if meshes else None
+        return collate(items, their_meshes)
 
     def subset(self, indices: Sequence[int]) -> Self:
         """Return a dataset of some of the bodies, with the same `classes`, so that labels are unchanged."""
@@ -261,7 +268,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
     def usable(self, failures: Sequence[Failure]) -> Self:
         """Return a dataset without the bodies that failed."""
         failed = {failure.id for failure in failures}
-        return self.subset([i for i, name in enumerate(self.bodies.names) if name not in failed])
+        usable = [i for i, name in enumerate(self.bodies.names) if name not in failed]
+        return self.subset(usable)
 
     def to_memory(self, change: Callable[[Signature], Signature] | None = None) -> Self:
         """Return a dataset with all Signatures, before `transform`, in memory.
@@ -269,9 +277,10 @@ class SignatureDataset(Dataset[LabelledSignature]):
         Signatures that are not cached are computed. If given, `change` is applied to each; `FewerSamples` saves memory.
         """
         dataset = copy.copy(self)
-        dataset._loaded = [
-            copy.deepcopy(s if change is None else change(s)) for s in self.signatures()
-        ]
+        dataset._loaded = []
+        for signature in self.signatures():
+            kept = signature if change is None else change(signature)
+            dataset._loaded.append(copy.deepcopy(kept))
         if change is not None:  # the cache entries no longer belong to the Signatures
             dataset._hits = (None,) * len(self)
         return dataset
