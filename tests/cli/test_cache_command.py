@@ -38,5 +38,5 @@ def test_a_mesh_in_place_of_a_folder_is_told_as_such(tmp_path, capsys):
             run(*command, "--cache_dir", tmp_path / "cache")
         assert (
             capsys.readouterr().err
-            == f"igps: {tmp_path / 'egg.off'}: expected a folder, got a file.\n"
+            == f"igps: {tmp_path / 'egg.off'}: expected a folder, got a file. Check the path.\n"
         )

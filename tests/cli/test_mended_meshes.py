@@ -152,7 +152,7 @@ def test_every_command_that_reads_meshes_has_the_choice(command, capsys):
         run(*command.split(), "--help")
     text = capsys.readouterr().out
     assert "--mend {auto,never,always}" in text
-    assert "auto repairs a surface as little as possible" in " ".join(text.split())
+    assert "auto: repair a surface as little as possible" in " ".join(text.split())
 
 
 def test_the_commands_that_read_no_meshes():
