@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from igps._arrays import Floats
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import area_vectors, unit
+from igps.mesh.surface import area_vectors, lengths, unit
 
 _N_COARSE, _N_FINE, _N_TARGET = 200, 1000, 6000  # points on the surfaces
 _N_COARSE_STEPS, _N_FINE_STEPS = 10, 30
@@ -72,7 +72,7 @@ def _spread(mesh: Mesh, n: int) -> tuple[Floats, Floats]:
     """Return points (n, 3) spread over a surface by area, in random order, and the normals there."""
     random = np.random.default_rng(0)
     vectors = area_vectors(mesh.vertices, mesh.faces)
-    ends = np.linalg.norm(vectors, axis=1).cumsum()
+    ends = lengths(vectors).cumsum()
     shares = (np.arange(n) + random.random(n)) / n
     faces = np.searchsorted(ends, shares * ends[-1])
     chosen = random.permutation(np.minimum(faces, len(ends) - 1))
@@ -107,7 +107,7 @@ def _fitted(motion: Motion, points: Floats, target: _Target, n_steps: int) -> Mo
         kept = np.argsort(np.abs(gaps))[:n_kept]
         normals = target.normals[nearest[kept]]
         centre = moved.mean(axis=0)
-        size = np.linalg.norm(moved - centre, axis=1).mean()
+        size = lengths(moved - centre).mean()
         arms = (moved[kept] - centre) / size
         columns = np.hstack([np.cross(arms, normals), normals])
         # Bodies of revolution leave a turn free: the smallest solution does not turn them

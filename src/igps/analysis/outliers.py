@@ -34,7 +34,7 @@ from igps.mesh.errors import MeshError
 from igps.mesh.loading import BodyRef, each_raw_body, surface_body
 from igps.mesh.mesh import Mesh, millimetres
 from igps.mesh.raw_body import RawBody
-from igps.mesh.surface import area_vectors
+from igps.mesh.surface import area_vectors, lengths
 
 if TYPE_CHECKING:
     # Loads torch, which workers do without
@@ -233,7 +233,7 @@ def measure_bodies(dataset: SignatureDataset, *, n_workers: int | None = None) -
 def flat_share(mesh: Mesh) -> float:
     """Return the largest share of the area in one plane: faces within 8° of its normal, within a mean edge length."""
     vectors = area_vectors(mesh.vertices, mesh.faces)
-    areas = np.linalg.norm(vectors, axis=1)
+    areas = lengths(vectors)
     normals = vectors / np.maximum(areas, 1e-300)[:, None]
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     thickness = np.sqrt(areas.mean())

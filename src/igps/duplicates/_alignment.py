@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from igps._arrays import Floats, Integers
-from igps.mesh.surface import area_vectors, face_areas, undirected_edges, unit
+from igps.mesh.surface import area_vectors, dots, face_areas, lengths, undirected_edges, unit
 
 # Lengths are over √area.
 _NORMAL_WEIGHT = 0.1  # of normals in the search for the nearest sample, to tell apart the two sides of a thin sheet
@@ -139,12 +139,12 @@ class TriangleSurface:
         sides = np.argsort(edge_of_side, kind="stable")
         starts = (np.cumsum(count) - count)[is_between_two]
         pairs = np.stack([sides[starts], sides[starts + 1]]) // 3  # the two faces (2, E) of edges
-        cosines = np.einsum("ei,ei->e", *self._normals[pairs])
+        cosines = dots(*self._normals[pairs])
         bends = np.arccos(np.clip(cosines, -1, 1))
         start, end = edges[is_between_two].T
-        lengths = np.linalg.norm(self._vertices[start] - self._vertices[end], axis=1)
+        chords = lengths(self._vertices[start] - self._vertices[end])
         areas = face_areas(self._vertices, self._faces)
-        widths = 2 * areas[pairs] / np.maximum(lengths, 1e-12)
+        widths = 2 * areas[pairs] / np.maximum(chords, 1e-12)
         play = widths / 2 * np.tan(bends / 4)
         flat, round_, arc = np.radians(_BENDS)
         play[:, bends > round_] = np.inf
@@ -251,13 +251,13 @@ def changed_share(one: SurfaceSamples, other: SurfaceSamples, tolerance: float) 
             fits.append(_fit(few, target, alignment, _N_FINE_STEPS))
     _, alignment = min(fits, key=itemgetter(0))
     for _ in range(_N_TRIMMED):
-        apart = np.linalg.norm(_offsets(alignment(one), target), axis=1)
+        apart = lengths(_offsets(alignment(one), target))
         is_near = apart <= np.median(apart)
         half = SurfaceSamples(one.points[is_near], one.normals[is_near])
         _, alignment = _fit(half, target, alignment, _N_LAST_STEPS)
     moved = alignment(one)
     play = one.surface().play_at(one) + target.play_at(moved)
-    apart = np.linalg.norm(_offsets(moved, target), axis=1)
+    apart = lengths(_offsets(moved, target))
     on_flat = apart[play == 0]
     if len(on_flat) < _MIN_FLAT * len(apart):
         return 0.0
@@ -312,7 +312,7 @@ def _mean_square(
     ranks = np.arange(1, min(patch_size, len(samples.points)) + 1)
     _, neighbours = samples.tree.query(_with_normals(samples), k=ranks)
     means = _offsets(samples, target)[neighbours].mean(axis=1)
-    squares = np.einsum("ni,ni->n", means, means)
+    squares = dots(means, means)
     return float(squares.max() if patch_size == 1 else squares.mean())
 
 
@@ -320,7 +320,7 @@ def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) 
     """Return the offsets (P, 3) from samples to the surface of the target."""
     nearest, normals = target.nearest(samples)
     steps = nearest - samples.points
-    heights = np.einsum("ni,ni->n", steps, normals)
+    heights = dots(steps, normals)
     normal_part = heights[:, None] * normals
     lateral = steps - normal_part
     length = np.linalg.norm(lateral, axis=1, keepdims=True)
@@ -374,8 +374,8 @@ def _fit(
     for _ in range(n_steps):
         moved = alignment(samples)
         nearest, normals = target.nearest(moved)
-        residuals = np.einsum("ni,ni->n", nearest - moved.points, normals)
-        along_normals = np.einsum("ni,ni->n", moved.points, normals)
+        residuals = dots(nearest - moved.points, normals)
+        along_normals = dots(moved.points, normals)
         jacobian = np.column_stack([np.cross(moved.points, normals), normals, along_normals])
         normal_matrix = jacobian.T @ jacobian
         # Directions that the surface does not determine, such as rotations of a sphere, get no step
@@ -385,7 +385,7 @@ def _fit(
         if np.abs(step).max() < 1e-5:
             break
     offsets = _offsets(alignment(samples), target)
-    squares = np.einsum("ni,ni->n", offsets, offsets)
+    squares = dots(offsets, offsets)
     return float(np.sqrt(squares.mean())), alignment
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from igps._arrays import Floats, Integers, Surface
 from igps.duplicates._alignment import MAX_LOG_SCALE
-from igps.mesh.surface import area_vectors, directed_edges, face_areas
+from igps.mesh.surface import area_vectors, directed_edges, dots, face_areas, lengths
 
 # Quadrature with six nodes, exact for polynomials of degree four on a triangle (Dunavant 1985)
 _INNER = 0.445948490915965
@@ -42,7 +42,7 @@ def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
     flux = np.einsum("fqd,fd,q->fq", x.reshape(-1, 6, 3), vectors, _WEIGHTS).ravel()
     second = np.einsum("p,pi,pj->ij", flux, x, x) / 5
     along, axes = np.linalg.eigh(second)
-    square = np.einsum("pi,pi->p", x, x)
+    square = dots(x, x)
     total = along.sum()
     third = (flux * square) @ x / 6
     fourth = flux @ square**2 / 7
@@ -58,7 +58,7 @@ def moments(vertices: Floats, faces: Integers, max_move: float) -> Floats:
     h_scale = h_even[:, 0] / 2 - 1.5 * square / total
     h_length = scale * (h_third @ third / length + length * h_scale)
     h = np.column_stack([h_even, h_length])
-    weights = np.outer(np.linalg.norm(vectors, axis=1), _WEIGHTS).ravel()
+    weights = np.outer(lengths(vectors), _WEIGHTS).ravel()
     gram = (weights[:, None] * h).T @ h
     gram[np.diag_indices(6)] *= 1 + _SECOND_ORDER**2
     scaling = np.array([3, 5, 5, 5, 7, 0]) * MAX_LOG_SCALE / max_move

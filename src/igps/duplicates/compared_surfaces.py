@@ -38,7 +38,7 @@ from igps.mesh.errors import MeshError
 from igps.mesh.loading import load_mesh
 from igps.mesh.mending import Step, repair_steps
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import mean_of_neighbours
+from igps.mesh.surface import lengths, mean_of_neighbours
 from igps.signature.attributes import AttributeName
 from igps.signature.signature import Signature
 
@@ -243,7 +243,7 @@ class Surfaces:
         if not np.array_equal(faces_i, faces_j):
             return math.inf
         rotation, _ = orthogonal_procrustes(one, other)
-        return float(np.linalg.norm(one @ rotation - other, axis=1).max())
+        return float(lengths(one @ rotation - other).max())
 
     def _vertices_and_faces(self, i: int) -> tuple[Floats, Integers]:
         """Return the vertices of the file, centred and over √area, and the faces with sorted corners."""

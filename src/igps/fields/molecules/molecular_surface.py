@@ -31,7 +31,15 @@ from igps.mesh._level_set import MIN_ABS_VALUE, SPECK_VOLUME, fill_bubbles
 from igps.mesh.errors import MeshError
 from igps.mesh.isosurface import level_surface, simplify_surface
 from igps.mesh.mesh import Mesh
-from igps.mesh.surface import connected, face_areas, signed_volume, stacked, vertex_normals
+from igps.mesh.surface import (
+    connected,
+    dots,
+    face_areas,
+    lengths,
+    signed_volume,
+    stacked,
+    vertex_normals,
+)
 
 SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 
@@ -142,7 +150,7 @@ def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
     reach = radii[0] - radii[-1] + 1e-6
     pairs = cKDTree(centres).query_pairs(reach, output_type="ndarray")
     large, small = np.sort(pairs, axis=1).T
-    distance = np.linalg.norm(centres[large] - centres[small], axis=1)
+    distance = lengths(centres[large] - centres[small])
     is_inside = distance + radii[small] <= radii[large] + 1e-9
     is_outermost = np.ones(len(radii), dtype=bool)
     is_outermost[small[is_inside]] = False
@@ -177,7 +185,7 @@ def _exposed_area(centres: Floats, radii: Floats) -> float:
 def _neighbours(centres: Floats, radii: Floats) -> tuple[Integers, Integers]:
     """Return the neighbours of ball i, which intersect it, as `neighbours[first[i]:first[i + 1]]`, nearest first."""
     one, other = cKDTree(centres).query_pairs(2 * radii.max(), output_type="ndarray").T
-    distance = np.linalg.norm(centres[one] - centres[other], axis=1)
+    distance = lengths(centres[one] - centres[other])
     meets = distance < radii[one] + radii[other]
     ball = np.concatenate([one[meets], other[meets]])
     neighbour = np.concatenate([other[meets], one[meets]])
@@ -230,13 +238,13 @@ def _fit_to_field(field: Singles, vertices: Floats, faces: Integers) -> Floats:
     for _ in range(_N_ROUNDS):
         centres = vertices[faces].mean(axis=1)
         shift = means_at_vertices(centres, vertices, faces) - vertices
-        across = np.einsum("ij,ij->i", shift, normals)
+        across = dots(shift, normals)
         vertices = vertices + shift - across[:, None] * normals
         steps, normals = _steps(field, vertices)
         vertices = vertices - steps
     centres = vertices[faces].mean(axis=1)
     steps, normals = _steps(field, centres)
-    heights = np.einsum("ij,ij->i", steps, normals)[:, None]
+    heights = dots(steps, normals)[:, None]
     # Average at the vertices and back, so that neighbours move alike.
     heights = means_at_vertices(heights, vertices, faces)[faces].mean(axis=1)
     heights = means_at_vertices(heights, vertices, faces)
@@ -248,7 +256,7 @@ def _steps(field: Singles, points: Floats) -> tuple[Floats, Floats]:
     values = cubic_values(field, points)
     gradients = values[:, 1:]
     # The gradient of a distance has length 1. Where it is much shorter, as midway between two surfaces, it is useless.
-    slope = np.maximum(np.linalg.norm(gradients, axis=1), 0.5)
+    slope = np.maximum(lengths(gradients), 0.5)
     normals = gradients / slope[:, None]
     heights = np.clip(values[:, 0] / slope, -_MAX_STEP, _MAX_STEP)
     return heights[:, None] * normals, normals
@@ -299,7 +307,8 @@ def _add_thread(vertices: Floats, faces: Integers, a: int, b: int, girth: float)
         end = int(around[areas[around].argmax()])
         corners = vertices[faces[end]]
         centre = corners.mean(axis=0)
-        perimeter = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
+        sides = corners - np.roll(corners, 1, axis=0)
+        perimeter = lengths(sides).sum()
         width = min(girth / perimeter, _MAX_THREAD_WIDTH)
         rim = len(vertices) + np.arange(3)
         vertices = np.concatenate([vertices, centre + width * (corners - centre)])
@@ -309,7 +318,7 @@ def _add_thread(vertices: Floats, faces: Integers, a: int, b: int, girth: float)
     one, other = rims
 
     def length(rim: Integers) -> float:
-        return float(np.linalg.norm(vertices[one] - vertices[rim], axis=1).sum())
+        return float(lengths(vertices[one] - vertices[rim]).sum())
 
     # The rims face each other, so they run in opposite directions.
     rotations = [np.roll(other[::-1], k) for k in range(3)]
