@@ -125,7 +125,7 @@ CLOSED_FORMS = {
 
 
 @pytest.mark.parametrize("name", CLOSED_FORMS)
-def test_measures_are_those_of_closed_forms_in_any_position(name):
+def test_measures_of_a_turned_body_are_those_of_closed_forms(name):
     mesh, expected = CLOSED_FORMS[name]
     moved = Mesh(
         mesh.vertices @ ROTATION.T + [5, -3, 2],

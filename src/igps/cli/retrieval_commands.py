@@ -137,7 +137,7 @@ def extract(
     from igps.cli.reading import described, files_or_folder, write_mending_notes
     from igps.descriptors import descriptor as descriptor_of
     from igps.descriptors.measures import Measures
-    from igps.descriptors.size_and_side import SizeAndSide
+    from igps.descriptors.size_and_side import form_of
     from igps.nn.descriptor import EmbeddedDescriptor
 
     is_archive = out.suffix.lower() == ".npz"
@@ -145,9 +145,8 @@ def extract(
         raise ValueError(
             f"out: expected a file of a table ending in {' or '.join(SUFFIXES)}, got {out}."
         )
-    module = descriptor_of(descriptor)
-    inner = module.descriptor if isinstance(module, SizeAndSide) else module
-    if short and not isinstance(inner, EmbeddedDescriptor):
+    form_descriptor = form_of(descriptor_of(descriptor))
+    if short and not isinstance(form_descriptor, EmbeddedDescriptor):
         raise ValueError(
             f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}."
         )

@@ -61,7 +61,7 @@ def descriptor(
     learnable: bool | Collection[LayoutPart] = False,
     n_training_samples: int | None = None,
 ) -> Descriptor:
-    """Return a descriptor by its name or file, in evaluation mode unless it draws samples; a descriptor as it is.
+    """Return a descriptor by its name or file, in evaluation mode unless it draws samples.
 
     Example:
         >>> descriptor("interior").requirements.n_eigenpairs
@@ -72,7 +72,7 @@ def descriptor(
     Args:
         which: one of `NAMES` or `FIELD_NAMES`; or a name that an installed package adds; or a file,
             see `load`; or "package.module:NAME", where NAME is a descriptor or makes one; or a
-            descriptor. The suffix "+size" of a name compares size, "+side" distinguishes mirror
+            descriptor, which is used as it is. The suffix "+size" of a name compares size, "+side" distinguishes mirror
             images, "+ct" or "+ct=0.5" adds an attribute, see `WithAttributes`.
         size: "keep" compares size, see `SizeAndSide`; "auto" does so if all bodies have a unit.
         mirror: "distinct" distinguishes a body from its mirror image.
@@ -100,8 +100,9 @@ def descriptor(
     base = _base_descriptor(which)
     if parts or n_training_samples is not None:
         base = with_layout(base, parts, n_training_samples)
+    # Samples are drawn in training mode alone, and Lightning leaves a module in the mode in which it is given
     draws_samples = n_training_samples is not None
-    if draws_samples:  # which it does in training mode, into which Lightning would not put it
+    if draws_samples:
         base.train()
     compares_size = size == "keep" if units is None else keeps_size(size, units)[0]
     with_size = compares_size or SIZE in suffixes

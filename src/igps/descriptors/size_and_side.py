@@ -172,7 +172,7 @@ class SizeAndSide(Descriptor):
         return torch.cat([self.descriptor.shorten(form), side, size], dim=1)
 
     def wrap(self, descriptor: Descriptor) -> "SizeAndSide":
-        """Return an `SizeAndSide` of another descriptor with the same options and scales."""
+        """Return a `SizeAndSide` of another descriptor with the same options and scales."""
         has_side = self.twists is not None
         return SizeAndSide(descriptor, size=self.keeps_size, side=has_side, scale=self.scale)
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from igps._tensors import above_zero
 from igps.data.requirements import Requirements
 from igps.nn._kernels.pairs import count_pairs
 from igps.nn._kernels.pairs_by_torch import PairValues, euclidean_distances, pair_twists
@@ -101,10 +102,9 @@ class FoldHistogram(SampleHistogram):
         rows = counts.flatten(2).masked_fill(n_residues < 2, 0.0)  # without a pair
         # The sums depend on the weights of the samples, but on no other input that may have gradients.
         sums = rows.sum(dim=2, keepdim=True).detach()
-        tiny = torch.finfo(sums.dtype).tiny
         shares = self._shares(sums, n_residues)
-        shares = shares / shares.sum(dim=1, keepdim=True).clamp_min(tiny)
-        cells = rows / sums.clamp_min(tiny) * shares
+        shares = shares / above_zero(shares.sum(dim=1, keepdim=True))
+        cells = rows / above_zero(sums) * shares
         return cells.unflatten(2, counts.shape[2:])
 
     def _shares(self, sums: Tensor, n_residues: Tensor) -> Tensor:
